@@ -60,6 +60,14 @@ def shared() -> Path:
     return SHARED
 
 
+@pytest.fixture(scope="session", autouse=True)
+def power():
+    """No test takes it away: nobody waits for a disk, which takes milliseconds a line of a journal."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def small_heap():
     """Every evaluation collects garbage; with the objects of all earlier tests that took seconds per call."""

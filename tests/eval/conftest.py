@@ -33,14 +33,21 @@ class Keepers(defaultdict):
             keeper.drop()
 
 
+def keepers(kind):
+    """Builder of environments of a kind, which all files share, and then its end."""
+    from arena_newton.eval.play.env_cache import EnvCache
+
+    made = Keepers(lambda: EnvCache(kind))
+    yield made
+    made.drop()
+
+
 @pytest.fixture(scope="session")
 def kept_worlds():
     """Environments that all files share."""
-    from arena_newton.eval.play.env_cache import EnvCache
+    from arena_newton.eval.play.env_cache import CachedEnv
 
-    keepers = Keepers(EnvCache)
-    yield keepers
-    keepers.drop()
+    yield from keepers(CachedEnv)
 
 
 @pytest.fixture(scope="session")
@@ -48,14 +55,15 @@ def watched_worlds():
     """Environments that all files share and that keep a hash of every tick."""
     from watched import LastingWatchedEnv
 
-    from arena_newton.eval.play import env_cache
+    yield from keepers(LastingWatchedEnv)
 
-    def keeper():
-        return env_cache.EnvCache(LastingWatchedEnv)
 
-    keepers = Keepers(keeper)
-    yield keepers
-    keepers.drop()
+@pytest.fixture(scope="session")
+def quick_worlds():
+    """Environments that all files share and whose episodes soon succeed."""
+    from quick_worlds import QuickEnv
+
+    yield from keepers(QuickEnv)
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,8 @@ import tyro
 from arena_newton.eval.certification import jobs
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import agreement
+from arena_newton.eval.certification.checks.failures import failures
+from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.pages.tables import Table
 
 
@@ -112,6 +114,14 @@ def test_a_process_of_a_quick_certification_compares_no_rates_on_a_cpu(monkeypat
     for jobs_, verdict in ((0, "note"), (2, "pass")):
         given = CertifyOptions(quick=True, jobs=jobs_, checks=("engines",))
         assert agreement.engines(SimpleNamespace(options=given)).verdict == verdict
+
+
+def test_a_quick_check_of_any_task_has_an_outcome():
+    """Also of a task in which none of the kinds is scripted then: the real failures are read all the same."""
+    for task in INTERACTIONS:
+        given = {"tasks": (task,), "sample": ("twist2",), "evaluate": lambda cell: [], "episodes": 2}
+        found = failures(SimpleNamespace(options=SimpleNamespace(quick=True), **given))
+        assert found.verdict == "pass" and "0 of 0 scripted" in found.summary
 
 
 def test_one_plan_is_not_divided(tmp_path, monkeypatch):

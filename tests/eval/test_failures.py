@@ -330,14 +330,6 @@ def played(signals_of):
     return SimpleNamespace(tasks=("boxing", "football"), sample=("twist2",), evaluate=evaluate, options=whole)
 
 
-def test_a_quick_check_of_any_task_has_an_outcome():
-    """Also of a task in which none of the kinds is scripted then: the real failures are read all the same."""
-    for task in INTERACTIONS:
-        given = {"tasks": (task,), "sample": ("twist2",), "evaluate": lambda cell: [], "episodes": 2}
-        found = failures(SimpleNamespace(options=SimpleNamespace(quick=True), **given))
-        assert found.verdict == "pass" and "0 of 0 scripted" in found.summary
-
-
 @pytest.fixture
 def agreed(monkeypatch):
     """Real failures on which readers and rules agree."""
