@@ -13,8 +13,9 @@ import warp as wp
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
-from arena_newton.eval.certification.checks import solvable
+from arena_newton.eval.certification.checks import replays, solvable
 from arena_newton.eval.folders.recordings import ActionRecorder
+from arena_newton.eval.play.run import Factories
 from arena_newton.policies.experts.base import ExpertPolicy
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
@@ -24,34 +25,44 @@ HONEST = ("journal", "recording", "policy-inputs", "tracker-inputs")
 """Checks of an honest certification, from whose folder cheats go on."""
 
 
-def certified(folder, *checks):
+@pytest.fixture(scope="module")
+def certified(kept_worlds):
     """Exit code of a certification of Football through TWIST2, one episode a cell."""
     given = {"task": ("football",), "tracker": ("twist2",), "episodes": 1, "quick": True, "resume": True}
-    return certify.run(CertifyOptions(out=str(folder), checks=checks, **given))
+
+    def code(folder, *checks):
+        options = CertifyOptions(out=str(folder), checks=checks, **given)
+        return certify.run(options, Factories(env=kept_worlds))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solvable, "rule_sets", lambda: ("paper",))
+        patch.setattr(replays, "RECORDED_TICKS", 60)
+        yield code
 
 
 @pytest.fixture(scope="module")
-def honest(tmp_path_factory):
+def honest(certified, tmp_path_factory):
     """A folder in which nothing cheated, and its exit code."""
     folder = tmp_path_factory.mktemp("honest")
     return folder, certified(folder, *HONEST)
 
 
-def behind(monkeypatch, kind, after):
-    """Call `after` with each object of a class that is made: the back door of all cheats here."""
-    began = kind.__init__
+def behind(monkeypatch, kind, method, after):
+    """Call `after` with each object of a class whose method is called: the back door of all cheats here."""
+    began = getattr(kind, method)
 
-    def made(self, *given, **named):
-        began(self, *given, **named)
+    def called(self, *given, **named):
+        answer = began(self, *given, **named)
         after(self)
+        return answer
 
-    monkeypatch.setattr(kind, "__init__", made)
+    monkeypatch.setattr(kind, method, called)
 
 
 def teleporting_expert(monkeypatch, folder):
     """It puts the ball into the goal when it is near."""
     envs, act = [], ExpertPolicy.act
-    behind(monkeypatch, ArenaEnv, envs.append)
+    behind(monkeypatch, ArenaEnv, "reset", envs.append)
 
     def cheat(self, observation):
         env = envs[-1]
@@ -67,7 +78,7 @@ def teleporting_expert(monkeypatch, folder):
 def expert_that_holds_the_clock(monkeypatch, folder):
     """Each second tick does not count."""
     envs, act = [], ExpertPolicy.act
-    behind(monkeypatch, ArenaEnv, envs.append)
+    behind(monkeypatch, ArenaEnv, "reset", envs.append)
 
     def cheat(self, observation):
         envs[-1].tick -= envs[-1].tick > 40
@@ -90,7 +101,7 @@ def moved_targets(monkeypatch, look):
 def tracker_that_reads_the_coming_reference(monkeypatch, folder):
     """It looks into the chunk that the policy has given, five ticks ahead."""
     rollouts = []
-    behind(monkeypatch, Rollout, rollouts.append)
+    behind(monkeypatch, Rollout, "__init__", rollouts.append)
 
     def ahead():
         chunk = rollouts[-1]._chunk
@@ -102,7 +113,7 @@ def tracker_that_reads_the_coming_reference(monkeypatch, folder):
 def tracker_that_reads_the_objects(monkeypatch, folder):
     """It looks where the ball is, as seen from the robot."""
     envs = []
-    behind(monkeypatch, ArenaEnv, envs.append)
+    behind(monkeypatch, ArenaEnv, "reset", envs.append)
 
     def ball():
         env = envs[-1]
@@ -199,13 +210,12 @@ def test_the_honest_pass(honest, capsys):
 
 
 @pytest.mark.parametrize(("check", "cheat"), CHEATS, ids=[cheat.__name__ for _, cheat in CHEATS])
-def test_a_cheat_is_found_by_name(honest, tmp_path, monkeypatch, capsys, check, cheat):
+def test_a_cheat_is_found_by_name(honest, certified, tmp_path, monkeypatch, capsys, check, cheat):
     """`certify --quick` fails, and its line names the check."""
     folder = tmp_path / "cheat"
     if check != "solvable":
         shutil.copytree(honest[0], folder)
         shutil.rmtree(folder / "measured")
-    monkeypatch.setattr(solvable, "rule_sets", lambda: ("paper",))
     cheat(monkeypatch, folder)
     assert certified(folder, check) == 1
     assert re.search(rf"^fail  {check} ", capsys.readouterr().out, re.MULTILINE)

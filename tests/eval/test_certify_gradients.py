@@ -10,6 +10,8 @@ from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import gradients
 from arena_newton.eval.certification.checks.gradients import Agreement, Slopes, agreement_of, flight_slopes
+from arena_newton.eval.play.env_cache import EnvCache
+from arena_newton.eval.play.run import Factories
 
 ESTIMATES = torch.tensor([1.0, -2.0, 0.001, 0.5, 1.5])
 
@@ -77,16 +79,29 @@ def test_a_kink_on_each_side_is_one():
     assert agreement_of(found).error < 1e-9 and 0 < agreement_of(found).compared < 40
 
 
-def certified(folder):
-    """Exit code and finding of a certification of football's gradients through one tracker."""
+@pytest.fixture
+def certified():
+    """Exit code and finding of a certification of football's gradients through one tracker, with a short start-up."""
     flags = {"task": ("football",), "tracker": ("pd",), "quick": True, "checks": ("gradients",)}
-    code = certify.run(CertifyOptions(out=str(folder), **flags))
-    return code, json.loads((folder / "certify.json").read_text())["checks"]["gradients"]
+    kept = EnvCache()
+
+    def env(task, **options):
+        made = kept(task, **options)
+        made.startup_ticks = 4
+        return made
+
+    def result(folder):
+        code = certify.run(CertifyOptions(out=str(folder), **flags), Factories(env=env))
+        return code, json.loads((folder / "certify.json").read_text())["checks"]["gradients"]
+
+    yield result
+    kept.drop()
 
 
-def test_the_gradients_of_a_task(tmp_path, monkeypatch):
+def test_the_gradients_of_a_task(certified, tmp_path, monkeypatch):
     """Conversion, margin and flight of football agree; kernels whose adjoints are off by a percent do not."""
-    monkeypatch.setattr(gradients, "TICKS", (60, 60))
+    monkeypatch.setattr(gradients, "TICKS", (17, 17))
+    monkeypatch.setattr(gradients, "FLIGHT", 5)
     code, found = certified(tmp_path / "right")
     assert code == 0 and found["verdict"] == "pass", found
     rows = {row[2]: row[3:] for row in found["tables"][0]["rows"]}
