@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import io
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -413,9 +412,8 @@ def test_latex_is_whole(suite, tmp_path):
         assert (tmp_path / "tables.pdf").stat().st_size > 1000
 
 
-def test_several_trainings_of_a_recipe_have_a_table(tmp_path, monkeypatch):
+def test_several_trainings_of_a_recipe_have_a_table(tmp_path):
     """Policies `act#1` to `act#3` are one recipe: their successes, mean and standard deviation are one row."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
     plan = [(cell_of(f"act#{n}", "act", "sonic", "boxing"), outcomes(won)) for n, won in ((1, 30), (2, 36), (3, 42))]
     made = {t.name: t for t in suite_tables(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())}
     shown = row(made["trainings"], "act", "sonic", "sonic", "Boxing", "base")
