@@ -128,7 +128,7 @@ def _ask(
             if not openpi:
                 socket.send(vla_eval_codec.pack_hello(None, 1, 0.0))
             socket.recv()
-            while time.monotonic() < end:
+            while not times or time.monotonic() < end:
                 began = time.monotonic()
                 socket.send(body)
                 if isinstance(socket.recv(timeout=120), str):

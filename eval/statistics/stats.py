@@ -304,7 +304,7 @@ class Contrast:
     low: float
     high: float
     middle: float
-    """Of the interval: the sum with made episodes."""
+    """Of the interval: the sum with pseudo-episodes."""
     error: float
     """Standard error."""
     strata: int
@@ -319,7 +319,7 @@ def contrast(strata: Sequence[Sequence[tuple[float, Outcomes]]]) -> Contrast | N
     """Sum of weight x rate over conditions in strata, and its interval; the one of every difference of rates.
 
     Conditions of a stratum that share episodes are paired: those that all of them have count. Those that share none are
-    independent. The interval is normal, from the spread of the episodes' own sums. Two made episodes, whose outcomes
+    independent. The interval is normal, from the spread of the episodes' own sums. Two pseudo-episodes, whose outcomes
     are as those of fair coins, keep it from closing where nothing varies. Of one difference it is that of Agresti, A.
     and Min, Y. (2005), Simple improved confidence intervals for comparing matched proportions, Statistics in Medicine
     24, where paired, and of Agresti, A. and Caffo, B. (2000), Simple and effective confidence intervals for

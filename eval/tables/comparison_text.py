@@ -42,7 +42,7 @@ METHOD = (
     "alike. The first letters are of the best.",
     "Rates have 95 % Wilson intervals. Δ is the first rate minus the second in points, over all tasks the mean of the "
     "tasks' differences, with its 95 % interval (Agresti and Min where paired, Agresti and Caffo where not; of several "
-    "tasks the made episodes that move its middle are shared out, after Price and Bonett).",
+    "tasks the pseudo-episodes that move its middle are shared out, after Price and Bonett).",
     "An episode that ended with an error counts as no success.",
 )
 """Paragraphs on the methods behind the figures."""

@@ -11,6 +11,7 @@ from arena_newton.eval import __main__ as evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
+FOLDERS = "arena_newton eval policies trackers kernels usd_scenes tests benchmarks examples docs".split()
 
 
 def test_the_index_names_every_page():
@@ -26,7 +27,9 @@ def anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS], ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
-    """Files and headings that a page links to are there."""
+    """Files and headings that a page links to are there, and files of the repository that it names."""
+    for path in re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]+)`", page.read_text()):
+        assert (ROOT / path).exists(), path
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if not target.startswith("http"):
             file, _, heading = target.partition("#")

@@ -14,6 +14,7 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack, suppress
 
 import msgpack
+import numpy as np
 import pytest
 from served_policies import Remembers, look, state, together
 
@@ -180,6 +181,27 @@ def test_large_messages_are_read_one_by_one(monkeypatch):
         readers.close()
     with pytest.raises(CancelledError):
         readers.run(usual, int)
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
+def test_robots_with_the_largest_pictures_are_read_one_by_one(served, monkeypatch, protocol):
+    """Robots that send the largest pictures at once are all answered, and never are two of these read together."""
+    monkeypatch.setattr(message_readers, "LONGEST_PAUSE", 0.0)
+    one = served(Remembers(sees=True), protocol)
+    openpi = protocol == "openpi"
+    raw = openpi_codec.pack_request(look(image=np.zeros((*LARGEST[::-1], 3), np.uint8)))
+    frame = raw if openpi else asked_with(front=picture(*LARGEST))
+
+    def ask():
+        with one.socket() as robot:
+            if openpi:
+                robot.recv(timeout=30)
+            robot.send(frame)
+            answer = robot.recv(timeout=30)
+            return "actions" in (msgpack.unpackb(answer) if openpi else vla_eval_codec.unpack_message(answer).payload)
+
+    assert together(*[ask] * 4) == [True] * 4
+    assert message_readers.LARGE < one.server.readers.most_inside < 2 * message_readers.LARGE
 
 
 def raise_damaged():
