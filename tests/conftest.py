@@ -75,6 +75,14 @@ def small_heap():
     gc.freeze()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_loss_of_power():
+    """Nothing waits for the disk: all files of a test are gone after it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def football_native():
     """Football on native MuJoCo, three worlds."""

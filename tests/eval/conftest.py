@@ -9,17 +9,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def installed():
-    """Versions of the installed packages are read once, not by every command."""
-    from arena_newton import doctor
-
-    found = doctor.versions()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor, "versions", lambda: dict(found))
-        yield
-
-
 @pytest.fixture(scope="session")
 def made_suite(tmp_path_factory):
     """A suite of known outcomes."""
