@@ -439,6 +439,7 @@ def second_process(arguments):
     torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
 
 
+@pytest.mark.release
 def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
     """As under torchrun on the CPU: both processes end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
