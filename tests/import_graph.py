@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import ast
 import collections
+import functools
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import permutations
@@ -71,6 +72,11 @@ class Module:
     path: Path
     tree: ast.Module
 
+    @functools.cached_property
+    def nodes(self) -> list[ast.AST]:
+        """Syntax tree, flat."""
+        return list(ast.walk(self.tree))
+
     @property
     def room(self) -> str:
         """Top-level folder."""
@@ -106,12 +112,11 @@ def statements(tree: ast.AST, *, checking: bool = False) -> Iterator[tuple[ast.I
             if isinstance(child, ast.Import | ast.ImportFrom):
                 if runs != checking:
                     yield child, late
-            elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            elif isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
                 for part, others in ((child.body, False), (child.orelse, True)):
                     yield from walk(ast.Module(part, []), late, others)
-            else:
-                function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-                yield from walk(child, late or function, runs)
+            elif not isinstance(child, ast.expr):
+                yield from walk(child, late or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef), runs)
 
     yield from walk(tree, False, True)
 

@@ -5,17 +5,23 @@ Each test lists everything that breaks its rule, as `file:line: what`, and each 
 
 import ast
 import collections
+import functools
 import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
+from arena_newton.eval.records.identity import UNHASHED
 from tests.import_graph import (
     BENCHMARKS,
     INNER,
     PACKAGE,
+    Import,
     Module,
     circles,
     imports,
@@ -27,8 +33,6 @@ from tests.import_graph import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
-KNOWN = modules(ROOT)
-EDGES = imports(KNOWN)
 
 HEAVY = set("torch warp newton mujoco mujoco_warp pxr lerobot matplotlib cv2 av onnx onnxruntime rsl_rl".split())
 HEAVY |= {"safetensors", "trimesh"}
@@ -80,6 +84,18 @@ STEMS = {
 """Stems that two modules share, and why."""
 
 
+@functools.cache
+def known() -> dict[str, Module]:
+    """Every module of the product by its name."""
+    return modules(ROOT)
+
+
+@functools.cache
+def edges() -> list[Import]:
+    """Every import of one by another that runs."""
+    return imports(known())
+
+
 def place(module: Module, line: int) -> str:
     """File and line as an editor opens them."""
     return f"{module.path.relative_to(ROOT)}:{line}"
@@ -93,12 +109,12 @@ def report(found: list[str]) -> None:
 
 def test_imports_have_no_circle():
     """No module imports itself through others, imports inside functions counted."""
-    groups = circles(EDGES)
+    groups = circles(edges())
     report(
         [
-            f"{place(KNOWN[e.source], e.line)}: imports {e.target}, circle of {', '.join(group)}"
+            f"{place(known()[e.source], e.line)}: imports {e.target}, circle of {', '.join(group)}"
             for group in groups
-            for e in EDGES
+            for e in edges()
             if e.source in group and e.target in group
         ]
     )
@@ -106,20 +122,20 @@ def test_imports_have_no_circle():
 
 def test_imports_run_one_way():
     """No room imports a room above it: kernels, the world and its scenes, trackers, policies, eval, benchmarks."""
-    report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in upward(EDGES, KNOWN)])
+    report([f"{place(known()[e.source], e.line)}: imports {e.target}" for e in upward(edges(), known())])
 
 
 def test_rooms_stand_in_order():
     """No room imports one of its folder that does not stand below it, for type checkers neither; each has its place."""
-    found = upward_rooms([*EDGES, *imports(KNOWN, checking=True)])
-    report([f"{place(KNOWN[e.source], e.line)}: imports {e.target}" for e in found])
+    found = upward_rooms([*edges(), *imports(known(), checking=True)])
+    report([f"{place(known()[e.source], e.line)}: imports {e.target}" for e in found])
     for folder, order in INNER.items():
-        assert {part_of(name, folder) for name in KNOWN} - {""} == set(order.replace("|", " ").split()), folder
+        assert {part_of(name, folder) for name in known()} - {""} == set(order.replace("|", " ").split()), folder
 
 
 def test_rooms_are_small():
     """No folder holds more than 20 modules; the front doors of the world and of the evaluation hold few."""
-    count = collections.Counter(module.path.parent for module in KNOWN.values() if module.path.name != "__init__.py")
+    count = collections.Counter(module.path.parent for module in known().values() if module.path.name != "__init__.py")
     report([f"{folder.relative_to(ROOT)}: {number} modules" for folder, number in count.items() if number > MOST_FILES])
     assert count[ROOT / "eval"] <= 2 and count[ROOT / PACKAGE] <= 9
 
@@ -127,7 +143,7 @@ def test_rooms_are_small():
 def test_the_page_of_rooms_names_each():
     """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
     page = (ROOT / "docs" / "design" / "rooms.md").read_text()
-    packages = {module.name for module in KNOWN.values() if module.path.name == "__init__.py"}
+    packages = {module.name for module in known().values() if module.path.name == "__init__.py"}
     for folder in (PACKAGE, f"{PACKAGE}.data", f"{PACKAGE}.policies", f"{PACKAGE}.eval"):
         title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"
         listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
@@ -144,8 +160,8 @@ QUESTION = re.compile(r"(What|Who|Whose|Whether|Where|When|Which|How)\b")
 def test_docstrings_name_what_they_describe():
     """No docstring of the product begins like a question: `True if …`, not `Whether …`."""
     found = collections.defaultdict(list)
-    for module in KNOWN.values():
-        for node in ast.walk(module.tree):
+    for module in known().values():
+        for node in module.nodes:
             text = node.value.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) else None
             if isinstance(text, str) and QUESTION.match(text):
                 found[str(module.path.parent.relative_to(ROOT))].append(f"{place(module, node.lineno)}: {text[:60]}")
@@ -160,16 +176,15 @@ def private(name: str) -> bool:
 def test_private_names_stay_at_home():
     """No module imports or reads another one's private names."""
     found = []
-    for module in KNOWN.values():
+    for module in known().values():
         for statement, _ in statements(module.tree):
             if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, BENCHMARKS)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
-        nodes = list(ast.walk(module.tree))
         # Attributes that the file sets, methods that it defines: its own, on whatever they are read.
-        own = {n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
-        own |= {n.name for n in nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
-        own |= {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        own = {n.attr for n in module.nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+        own |= {n.name for n in module.nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+        own |= {n.id for n in module.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
         strangers = set()  # modules of other packages keep their own order
         for statement, _ in statements(module.tree):
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
@@ -177,7 +192,7 @@ def test_private_names_stay_at_home():
                 if not (source or alias.name).startswith((PACKAGE, BENCHMARKS)):
                     strangers.add((alias.asname or alias.name).split(".")[0])
         inherited = {"_replace", "_asdict"}
-        for node in nodes:
+        for node in module.nodes:
             if isinstance(node, ast.Attribute) and private(node.attr) and node.attr not in own | inherited:
                 base = ast.unparse(node.value).split(".")[0].split("(")[0]
                 if base not in strangers | {"self", "cls", "super"}:
@@ -185,10 +200,10 @@ def test_private_names_stay_at_home():
     report(found)
 
 
-def signatures(tree: ast.Module) -> list[tuple[int, ast.expr]]:
+def signatures(module: Module) -> list[tuple[int, ast.expr]]:
     """Line and annotation of every argument and answer."""
     found = []
-    for node in ast.walk(tree):
+    for node in module.nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             a = node.args
             for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))):
@@ -202,9 +217,9 @@ def signatures(tree: ast.Module) -> list[tuple[int, ast.expr]]:
 def test_signatures_say_types():
     """`Any` is in few signatures of the world, the policies and the evaluation, each for a reason."""
     found = []
-    for module in KNOWN.values():
+    for module in known().values():
         if module.room in (PACKAGE, "eval", "policies"):
-            for line, annotation in signatures(module.tree):
+            for line, annotation in signatures(module):
                 if re.search(r"\bAny\b", ast.unparse(annotation)):
                     found.append((str(module.path.relative_to(ROOT)), place(module, line)))
     report([where for file, where in found if file not in ANY])
@@ -212,20 +227,20 @@ def test_signatures_say_types():
     assert not set(ANY) - {file for file, _ in found}, "no longer needed"
 
 
-def light() -> set[str]:
-    """The modules that a `--help` or a plan loads."""
+def loaded(*starts: str) -> set[str]:
+    """Modules that an import of these loads, imports inside functions aside."""
     following = collections.defaultdict(set)
-    for edge in EDGES:
+    for edge in edges():
         if not edge.late:
             following[edge.source].add(edge.target)
     found: set[str] = set()
-    todo = [f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING)]
+    todo = [*starts]
     while todo:
         name = todo.pop()
         if name not in found:
             found.add(name)
             packages = [name.rsplit(".", n)[0] for n in range(1, name.count(".") + 1)]
-            todo += [*following[name], *(p for p in packages if p in KNOWN)]
+            todo += [*following[name], *(p for p in packages if p in known())]
     return found
 
 
@@ -237,8 +252,8 @@ def tops(statement: ast.Import | ast.ImportFrom) -> set[str]:
 
 def test_heavy_imports_stand_at_the_top():
     """Only what a `--help` or a plan loads imports heavy libraries late; it imports none at its top."""
-    found, lights = [], light()
-    for module in KNOWN.values():
+    found, lights = [], loaded(f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING))
+    for module in known().values():
         for statement, late in statements(module.tree):
             for name in sorted(tops(statement) & HEAVY):
                 if not late and module.name in lights:
@@ -248,12 +263,65 @@ def test_heavy_imports_stand_at_the_top():
                 if late and module.name not in lights | set(LATE) and name not in OPTIONAL:
                     found.append(f"{place(module, statement.lineno)}: {name} inside a function")
     report(found)
-    assert not set(LATE) - set(KNOWN), "no such module"
+    assert not set(LATE) - set(known()), "no such module"
+
+
+def test_lerobots_plug_in_is_light():
+    """Its import loads neither physics nor renderer, so that LeRobot's help and checks do not wait for them."""
+    found = [
+        f"{place(known()[name], statement.lineno)}: {ast.unparse(statement)}"
+        for name in loaded(f"{PACKAGE}.eval.adapters.lerobot_env")
+        for statement, late in statements(known()[name].tree)
+        if not late and tops(statement) & {"warp", "newton", "mujoco", "pxr"}
+    ]
+    report(found)
+
+
+def test_what_is_imported_is_a_dependency():
+    """Every package that the code imports is named as a direct dependency or extra, not left to another's."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [line for lines in project["optional-dependencies"].values() for line in lines]
+    named = {Requirement(line).name for line in [*project["dependencies"], *extras]}
+    names = {"PIL": "pillow", "pxr": "usd-core", "warp": "warp-lang", "cv2": "opencv-python-headless"}
+    names |= {"zmq": "pyzmq", "sklearn": "scikit-learn", "huggingface_hub": "huggingface-hub"}
+    names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
+    # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
+    allowed = {*sys.stdlib_module_names, "_typeshed", PACKAGE, BENCHMARKS, "tensordict"}
+    # Run by the interpreter of that other program, never imported.
+    theirs = {f"{BENCHMARKS}.mjlab_training": {"mjlab"}}
+    found = []
+    for module in known().values():
+        for node in module.nodes:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                for top in tops(node) - allowed - theirs.get(module.name, set()):
+                    if names.get(top, top) not in named:
+                        found.append(f"{place(module, node.lineno)}: imports {top}")
+    report(found)
+
+
+def test_what_no_run_is_known_by_moves_nothing():
+    """Only plan and play import unhashed rooms, of these only what is stored, kept and reported; `pages` is for all."""
+    rooms = {f"{PACKAGE}.{room.replace('/', '.')}" for room in UNHASHED}
+
+    def unhashed(name: str) -> set[str]:
+        return {room for room in rooms if f"{name}.".startswith(f"{room}.")}
+
+    allowed = {f"{PACKAGE}.eval.{room}" for room in ("records", "folders", "reports", "statistics")}
+    found = []
+    for edge in [*edges(), *imports(known(), checking=True)]:
+        file = known()[edge.source].path
+        if unhashed(edge.source) or file.name == "__main__.py" or edge.source.startswith(BENCHMARKS):
+            continue
+        # A command line by another name; no run imports it.
+        if edge.source != f"{PACKAGE}.trackers.evaluate" and (reached := unhashed(edge.target) - {f"{PACKAGE}.pages"}):
+            if part_of(edge.source, f"{PACKAGE}.eval") not in ("plan", "play") or not reached <= allowed:
+                found.append(f"{place(known()[edge.source], edge.line)}: imports {edge.target}")
+    report(found)
 
 
 def test_files_are_short():
     """No file of the product or its tests is longer than one sitting."""
-    files = [m.path for m in KNOWN.values()] + sorted((ROOT / "tests").rglob("*.py"))
+    files = [m.path for m in known().values()] + sorted((ROOT / "tests").rglob("*.py"))
     sizes = {str(path.relative_to(ROOT)): path.read_text().count("\n") for path in files}
     report([f"{file}:{MOST_LINES}: {lines} lines" for file, lines in sizes.items() if lines > MOST_LINES])
 
@@ -261,7 +329,7 @@ def test_files_are_short():
 def test_a_stem_names_one_thing():
     """Two modules have one name only where a table says why."""
     homes = collections.defaultdict(list)
-    for module in KNOWN.values():
+    for module in known().values():
         named = f"{PACKAGE}.eval.commands.{module.path.stem}"  # a command's file has the name of what it calls
         if not module.path.stem.startswith("__") and module.name != named:
             homes[module.path.stem].append(module)
@@ -273,7 +341,7 @@ def test_a_stem_names_one_thing():
 def test_a_class_name_names_one_thing():
     """No public class name stands twice."""
     homes = collections.defaultdict(list)
-    for module in KNOWN.values():
+    for module in known().values():
         for node in module.tree.body:
             if isinstance(node, ast.ClassDef) and not private(node.name):
                 homes[node.name].append(place(module, node.lineno))

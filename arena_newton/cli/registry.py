@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.metadata
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from arena_newton.errors import InputError
 
 __all__ = ["Registry"]
+
+
+@functools.cache
+def _installed(group: str, path: tuple[str, ...]) -> importlib.metadata.EntryPoints:
+    """Entry points of a group on a path; to look for them takes as long as hundreds of episodes' lines."""
+    return importlib.metadata.entry_points(group=group)
 
 
 class Registry[T]:
@@ -40,8 +48,7 @@ class Registry[T]:
 
     def points(self, name: str | None = None) -> list[importlib.metadata.EntryPoint]:
         """Entry points of other packages, of one name or all."""
-        found = importlib.metadata.entry_points(group=self.group)
-        return [point for point in found if name is None or point.name == name]
+        return [one for one in _installed(self.group, tuple(sys.path)) if name is None or one.name == name]
 
     def names(self) -> tuple[str, ...]:
         """All names, sorted."""

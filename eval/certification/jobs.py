@@ -19,6 +19,7 @@ from arena_newton.cli.flags import shell_command, words
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.agreement import BATCHED_TASKS
 from arena_newton.physics.devices import resolve_engine
+from arena_newton.tasks import get
 
 __all__ = ["Piece", "command_line", "flags", "play_ahead"]
 
@@ -64,8 +65,8 @@ LONGEST = ("shards", "ray", "failures", "swap")
 """Checks that take longest: they are begun before others, so that none is left when the others have ended."""
 WHOLE = ("physics", "camera")
 """Checks that are not divided: of some tasks they measure more than of the others."""
-OF_FEW = "batches"
-"""The check that under --quick plays the first `BATCHED_TASKS` tasks alone."""
+OF_FIRST_TASKS = {"batches": BATCHED_TASKS, "recording": 1, "policy-inputs": 1, "tracker-inputs": 1}
+"""Checks that under --quick play the first tasks alone, and how many of them."""
 PLAYS_NOTHING = ("statistics",)
 """Checks that are left to the end."""
 
@@ -117,9 +118,7 @@ def _unnamed(options: CertifyOptions, check: str, cuda: bool) -> bool:
 
 def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequence[str]) -> list[Piece]:
     """All checks of one task by one process: of a few episodes, a process's start is the longest part."""
-    cuda = resolve_engine("warp", None)[1] != "cpu"
     own = [check for check in checks if check not in (*ONE_PLAN, *WHOLE, *PLAYS_NOTHING)]
-    own = [check for check in own if not _unnamed(options, check, cuda)]
     if FIRST not in own and set(own) & set(COMPARING):
         own.insert(0, FIRST)
     pieces: list[Piece] = [
@@ -127,8 +126,8 @@ def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequenc
         for some in (tuple(check for check in checks if check in kind) for kind in (set(ONE_PLAN), set(WHOLE)))
         if some
     ]
-    for number, task in enumerate(tasks):
-        some = tuple(check for check in own if check != OF_FEW or number < BATCHED_TASKS)
+    for task in sorted(tasks, key=lambda name: -get(name).steps.paper):  # a long one is not begun last
+        some = tuple(check for check in own if tasks.index(task) < OF_FIRST_TASKS.get(check, len(tasks)))
         pieces += [Piece(some, (task,), options.tracker)] * bool(some)
     return pieces
 

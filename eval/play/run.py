@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import functools
 import gc
 import math
 import time
@@ -134,6 +135,12 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
     return config, read_by(policy, config.labels, late)
 
 
+@functools.cache
+def _freeze_libraries() -> None:
+    """Leave what loaded libraries hold out of the search for garbage at the end of each cell, which took seconds."""
+    gc.freeze()
+
+
 def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: int) -> World:
     """The environment of an episode's task, tracker and mode, as the run's flags say.
 
@@ -143,6 +150,7 @@ def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: 
         episode: One of its episodes.
         worlds: Worlds in the batch.
     """
+    _freeze_libraries()
     flags = config.flags
     return factories.env(
         episode.task,
@@ -312,9 +320,10 @@ class RunPlayer:
                 recorders.append(self.viewer)
             noise = recording.disturbance_of(config, task, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
-            described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
-            files = recording.demonstration_recorder(config, self.folder.path, described)
-            recorders += [] if files is None else [files]
+            if config.recording is not None:
+                described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
+                files = recording.demonstration_recorder(config, self.folder.path, described)
+                recorders.append(files)
 
             def keep(result: EpisodeResult, media: dict[str, str]) -> None:
                 pictures = recorder.media(result.episode) if recorder is not None else {}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
-import gc
 import io
 import time
 from collections.abc import Iterator, Sequence
@@ -86,9 +85,6 @@ class CellPlayer:
         if self.options.limit is not None:
             todo = todo[: self.options.limit]
         self._measure_before(cells)
-        # Each run looks for garbage at its end, among millions of objects of loaded libraries: seconds a cell.
-        gc.collect()
-        gc.freeze()
         if not self.play_cells(todo):
             print(f"\ninterrupted; {self._kept(chosen)}; continue with: {self.again}", flush=True)
             return 130

@@ -3,12 +3,17 @@
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 import tyro
 
 from arena_newton.eval.certification import jobs
 from arena_newton.eval.certification.certify_options import CertifyOptions
+from arena_newton.eval.certification.checks import agreement
+from arena_newton.eval.certification.checks.failures import failures
+from arena_newton.eval.plan.interaction import INTERACTIONS
+from arena_newton.pages.tables import Table
 
 
 def stand_in(tmp_path, monkeypatch, code=0):
@@ -50,7 +55,7 @@ def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     jobs.play_ahead(CertifyOptions(out="x", jobs=1, quick=True), ["football", "boxing"], ["swap"], said.append)
     assert len(log.read_text().splitlines()) == 2
     left = "twist2 sonic: left to the end: error: broken"
-    assert said == [f"solvable swap {task} {left}" for task in ("football", "boxing")]
+    assert said == [f"solvable swap {task} {left}" for task in ("boxing", "football")]
 
 
 def test_a_quick_process_plays_all_checks_of_a_task(tmp_path, monkeypatch):
@@ -60,7 +65,7 @@ def test_a_quick_process_plays_all_checks_of_a_task(tmp_path, monkeypatch):
     options = CertifyOptions(out="x", jobs=1, quick=True)
     jobs.play_ahead(options, ["football", "boxing", "sit_sofa"], checks, lambda text: None)
     asked = [line.split("--checks ")[1].split(" --")[0] for line in log.read_text().splitlines()]
-    few = "solvable rules batches swap"
+    few = "solvable rules batches swap"  # of the first two, and the task with the longest episodes first
     assert asked == ["shards", "physics camera", few, few, "solvable rules swap"]
 
 
@@ -94,10 +99,29 @@ def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path,
     for named, device in (((), "cpu"), (("engines",), "cpu"), ((), "cuda:0")):
         log.unlink(missing_ok=True)
         monkeypatch.setattr(jobs, "resolve_engine", lambda engine, given, device=device: (engine, device))
-        options = CertifyOptions(out="x", jobs=1, quick=True, checks=named)
+        options = CertifyOptions(out="x", jobs=1, checks=named)
         jobs.play_ahead(options, ["boxing"], ["engines", "execution"], lambda text: None)
-        (asked,) = [line.split("--checks ")[1].split(" --")[0] for line in log.read_text().splitlines()]
-        assert asked == ("solvable engines execution" if named or device != "cpu" else "execution")
+        asked = [line.split("--checks ")[1].split(" --")[0] for line in log.read_text().splitlines()]
+        played = ["engines"] * 2 if named or device != "cpu" else []
+        assert asked == ["solvable", "solvable", *played, "execution"]
+
+
+def test_a_process_of_a_quick_certification_compares_no_rates_on_a_cpu(monkeypatch):
+    """Its flags name all checks of its task, `engines` among them, and nobody asked for hours on Warp's CPU backend."""
+    monkeypatch.setattr(agreement, "_same_start", lambda *_: ("first ticks", Table((), ()), []))
+    monkeypatch.setattr(agreement, "_rates", lambda *_: ("pass", "rates", Table((), ()), ()))
+    monkeypatch.setattr(agreement, "resolve_engine", lambda engine, device: (engine, "cpu"))
+    for jobs_, verdict in ((0, "note"), (2, "pass")):
+        given = CertifyOptions(quick=True, jobs=jobs_, checks=("engines",))
+        assert agreement.engines(SimpleNamespace(options=given)).verdict == verdict
+
+
+def test_a_quick_check_of_any_task_has_an_outcome():
+    """Also of a task in which none of the kinds is scripted then: the real failures are read all the same."""
+    for task in INTERACTIONS:
+        given = {"tasks": (task,), "sample": ("twist2",), "evaluate": lambda cell: [], "episodes": 2}
+        found = failures(SimpleNamespace(options=SimpleNamespace(quick=True), **given))
+        assert found.verdict == "pass" and "0 of 0 scripted" in found.summary
 
 
 def test_one_plan_is_not_divided(tmp_path, monkeypatch):

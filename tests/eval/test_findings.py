@@ -2,14 +2,13 @@
 
 import csv
 import itertools
-import os
 import re
 import shutil
 import statistics
 from pathlib import Path
 
 import pytest
-from made_suites import HOI, HSI, cell_of, outcomes, write_suite
+from made_suites import HOI, HSI, cell_of, outcomes
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
@@ -17,6 +16,7 @@ from arena_newton.eval.commands.tables import BEGIN, END
 from arena_newton.eval.statistics.stats import contrast, holm, paired_rates, suites, wilson
 from arena_newton.eval.statistics.trainings import DROP_SPREAD, MATCHED_SPREAD, SWAPPED_SPREAD
 from arena_newton.eval.tables import findings_text, paper_claims
+from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import paper_numbers
 from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
@@ -28,6 +28,14 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 def cells(made_suite):
     """Cells of a suite of known outcomes."""
     return read_cells([made_suite])
+
+
+@pytest.fixture(scope="module")
+def counts(made_suite, tmp_path_factory):
+    """Their counts, as `tables` writes them."""
+    folder = tmp_path_factory.mktemp("counts")
+    assert main(["tables", str(made_suite), "--format", "csv", "--out", str(folder)]) == 0
+    return folder / "cells.csv"
 
 
 def verdicts(found):
@@ -49,11 +57,19 @@ def played_by(trainings, swapped=45, visual=45, won=45, families=(("act", "act")
     return cells
 
 
-def findings_of(tmp_path, monkeypatch, plan):
-    """Findings of a suite with these cells, by name."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
-    found = paper_claims.findings(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())
-    return {one.name: one for one in found}
+def findings_of(plan):
+    """Findings of cells with these outcomes, by name; episodes of one number begin alike."""
+    names = "policy family trained_on trained_tasks tracker task mode labels latency".split()
+    rest = {"replan": None, "ensemble": False, "records": (), "folder": Path("made")}
+    cells = [
+        EvaluatedCell(
+            **{name: getattr(cell, name) for name in names},
+            **rest,
+            tallied={kind: {n: one == kind for n, one in enumerate(ended)} for kind in ("success", "fall")},
+        )
+        for cell, ended in plan
+    ]
+    return {one.name: one for one in paper_claims.findings(cells, paper_numbers())}
 
 
 def test_findings_follow_the_data(cells):
@@ -77,53 +93,53 @@ def test_findings_follow_the_data(cells):
     assert "13 points" in text and "of 26 through another" in text and "28 of a difference" in text
 
 
-def test_a_claim_that_fails_does_not_reproduce(tmp_path, monkeypatch):
+def test_a_claim_that_fails_does_not_reproduce():
     """Where in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
-    said = verdicts(findings_of(tmp_path, monkeypatch, played_by(3)).values())
+    said = verdicts(findings_of(played_by(3)).values())
     assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
     assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"
     assert said["tracker-conditioned: same family"] == "does not"
     assert said["SR and AFR disagree: sonic"] == "not measured"
 
 
-def test_a_claim_that_holds_in_three_trainings_reproduces(tmp_path, monkeypatch):
+def test_a_claim_that_holds_in_three_trainings_reproduces():
     """Drops that all trainings share reproduce, by their own spread, which the page names."""
-    found = findings_of(tmp_path, monkeypatch, played_by(3, swapped=12, visual=20))
+    found = findings_of(played_by(3, swapped=12, visual=20))
     assert found["perturbation: visual drop"].verdict == found["cross-GMT: sonic → twist2"].verdict == "reproduces"
     assert "42 trainings" not in found["cross-GMT: sonic → twist2"].ours.replace("21 trainings", "")
     assert "their standard deviation measured" in found["cross-GMT: sonic → twist2"].ours
 
 
-def test_one_training_decides_nothing_small(tmp_path, monkeypatch):
+def test_one_training_decides_nothing_small():
     """A difference of 20 points in one training of one task is within what trainings differ by."""
     plan = [
         (cell_of("act", "act", tracker, "boxing"), outcomes(won)) for tracker, won in (("twist2", 50), ("sonic", 38))
     ]
-    found = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: same family"]
+    found = findings_of(plan)["tracker-conditioned: same family"]
     assert found.verdict == "undecided" and found.p_holm > 0.2 and "+20.0 points" in found.ours
 
 
-def test_verdicts_are_adjusted_for_all_claims(tmp_path, monkeypatch):
+def test_verdicts_are_adjusted_for_all_claims():
     """Each p counts the claims that were tested; a verdict stands only below the level after that."""
-    found = findings_of(tmp_path, monkeypatch, played_by(1, swapped=30, visual=30))
+    found = findings_of(played_by(1, swapped=30, visual=30))
     tested = [one for one in found.values() if one.p is not None]
     assert [one.p_holm for one in tested] == pytest.approx(holm([one.p for one in tested]))
     assert all((one.verdict == "undecided") == (one.p_holm >= 0.05) for one in tested)
 
 
-def test_more_policies_are_compared_on_fewer_tasks(tmp_path, monkeypatch):
+def test_more_policies_are_compared_on_fewer_tasks():
     """The runner-up that has three of seven tasks is compared on these, and who is left out is named."""
     plan = []
     for task, tracker in itertools.product((*HOI, *HSI), ("twist2", "sonic")):
         plan += [(cell_of("act", "act", tracker, task), outcomes(55))]
         plan += [(cell_of("dp", "diffusion", tracker, task), outcomes(53))] if task in HSI[:3] else []
         plan += [(cell_of("other", "act", tracker, task), outcomes(3))] if task == HOI[0] else []
-    said = findings_of(tmp_path, monkeypatch, plan)["tracker-conditioned: best family"]
+    said = findings_of(plan)["tracker-conditioned: best family"]
     assert said.verdict == "undecided" and "act is best with both; leads over the second, dp: +3.3 points" in said.ours
     assert said.ours.endswith(f"Compared: act, dp on {' '.join(HSI[:3])}; left out: other ({HOI[0]})")
 
 
-def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
+def test_merged_training_is_judged_by_its_own_trackers():
     """A merged policy of one tracker that another one executes is a swap, no effect of merging."""
     plan = []
     for task in HOI:
@@ -131,7 +147,7 @@ def test_merged_training_is_judged_by_its_own_trackers(tmp_path, monkeypatch):
         for tracker, won in (("twist2", 45), ("sonic", 0)):
             both = cell_of("all", "act", tracker, task, trained_on=("twist2",), tasks_of=HOI + HSI)
             plan.append((both, outcomes(won)))
-    one = findings_of(tmp_path, monkeypatch, plan)["merged training: TWIST2x7 HOI"]
+    one = findings_of(plan)["merged training: TWIST2x7 HOI"]
     assert one.ours.startswith("act: 0.0 points (") and "4 trainings" in one.ours
     assert one.verdict == "undecided" and "not separated" in one.remark
 
@@ -229,15 +245,15 @@ def test_published_intervals_are_those_of_their_counts(path):
                 assert sum(interval) / 2 == pytest.approx(found[0].middle, abs=1e-5), row
 
 
-def test_counts_say_what_episodes_said(made_suite, cells, tmp_path):
+def test_counts_say_what_episodes_said(counts, cells, tmp_path):
     """Findings of the written cells.csv have the values of those of the episodes, and know what it says of pairs."""
-    assert main(["tables", str(made_suite), "--format", "csv", "--out", str(tmp_path)]) == 0
-    assert main(["tables", str(tmp_path / "cells.csv"), "--out", str(tmp_path / "t")]) == 2
-    told = {one.name: one for one in paper_claims.findings(read_cells([tmp_path / "cells.csv"]).cells, paper_numbers())}
+    assert main(["tables", str(counts), "--out", str(tmp_path / "t")]) == 2
+    counted = read_cells([counts]).cells
+    told = {one.name: one for one in paper_claims.findings(counted, paper_numbers())}
     assert told["cross-GMT: asymmetric falls"].ours.endswith(" falls in all")
     for one in paper_claims.findings(cells.cells, paper_numbers()):
         assert told[one.name].ours.split(" points")[0] == one.ours.split(" points")[0], one.name
-    swap = [c for c in read_cells([tmp_path / "cells.csv"]).cells if (c.policy, c.task) == ("act v3.1", "football")]
+    swap = [c for c in counted if (c.policy, c.task) == ("act v3.1", "football")]
     matched, swapped = (
         next(c for c in swap if (c.tracker, c.mode) == (t, "base") and c.trained_on == ("twist2",))
         for t in ("twist2", "sonic")
@@ -254,10 +270,9 @@ def test_counts_say_what_episodes_said(made_suite, cells, tmp_path):
         ("ours", "mine", "has no cell of ours"),
     ],
 )
-def test_damaged_counts_are_refused(made_suite, tmp_path, was, now, message):
+def test_damaged_counts_are_refused(counts, tmp_path, was, now, message):
     """A file of counts with an impossible number is one error that names file and line."""
-    assert main(["tables", str(made_suite), "--format", "csv", "--out", str(tmp_path)]) == 0
     path = tmp_path / "cells.csv"
-    path.write_text(path.read_text().replace(was, now))
+    path.write_text(counts.read_text().replace(was, now))
     with pytest.raises(InputError, match=message):
         read_cells([path])

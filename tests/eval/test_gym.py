@@ -9,16 +9,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from watched import Table, WatchedEnv
+from watched import WatchedEnv, watched_rollout
 
-from arena_newton import tasks, trackers
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters import gym
 from arena_newton.eval.adapters.gym import ArenaVectorEnv
 from arena_newton.eval.plan import episode_plan
 from arena_newton.policies import get
 from arena_newton.robot.canonical import STAND_ACTION
-from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 
 BLIND = {"engine": "mujoco", "device": "cpu", "image_size": None}
@@ -28,9 +27,9 @@ WILD = np.random.default_rng(0).normal(size=(400, 40)).astype(np.float32)
 
 
 @pytest.fixture(autouse=True)
-def watched(monkeypatch):
-    """Every environment of these tests keeps the hashes of its ticks."""
-    monkeypatch.setattr(gym, "ArenaEnv", WatchedEnv)
+def watched(monkeypatch, watched_worlds):
+    """Every environment of these tests keeps the hashes of its ticks, and is built once."""
+    monkeypatch.setattr(gym, "ArenaEnv", watched_worlds)
     WatchedEnv.history.clear()
 
 
@@ -61,17 +60,6 @@ def wild(tick, worlds):
 def planned(task, count, **options):
     """The first episodes of the plan."""
     return episode_plan.expand([task], trackers=["twist2"], policy="table", seeds=[0], repeats=count, **options)
-
-
-def rollout(task, count, worlds, policy, recorder=(), tracker="twist2", max_steps=None):
-    """Play the first episodes of the plan in watched worlds; their hashes and results."""
-    env = WatchedEnv(task, tracker=trackers.get(tracker), worlds=worlds, engine="mujoco", device="cpu")
-    WatchedEnv.history.clear()
-    results = Rollout(env, policy, planned(task, count), recorder=recorder, max_steps=max_steps).run()
-    hashes = {seed: list(ticks) for seed, ticks in WatchedEnv.history.items()}
-    WatchedEnv.history.clear()
-    env.close()
-    return hashes, {result.episode.episode_seed: result for result in results}
 
 
 def test_every_task_has_an_id():
@@ -112,12 +100,13 @@ def test_what_it_returns_is_in_its_spaces(make):
 
 def test_an_observation_is_the_callers(make):
     """What was returned does not change with later steps."""
-    env = make(image_size=(40, 32))
+    env = make(image_size=(40, 32), settle="reset")
     first, _ = env.reset(seed=0)
     kept = {name: first[name].copy() for name in ("agent_pos", "pixels")}
-    for tick in range(60):
-        env.step(wild(tick, [True, True]))
-    assert all(np.array_equal(first[name], kept[name]) for name in kept)
+    for tick in range(10):
+        last, *_ = env.step(wild(tick, [True, True]))
+    for name in kept:
+        assert np.array_equal(first[name], kept[name]) and not np.array_equal(last[name], kept[name])
 
 
 def test_wrappers_of_gymnasium_work(make):
@@ -143,10 +132,10 @@ def test_one_world_passes_gymnasiums_checker():
 
 
 @pytest.mark.parametrize("settle", gym.SETTLE)
-def test_a_seed_is_an_episode_of_the_plan(make, settle):
+def test_a_seed_is_an_episode_of_the_plan(make, boxed, settle):
     """An expert's actions give the states of a rollout at every tick, start-up included, and its results."""
-    table = Table()
-    hashes, results = rollout("boxing", 2, 2, get("expert"), table)
+    table, hashes, played = boxed
+    results = {result.episode.episode_seed: result for result in played}
     env = make(settle=settle, autoreset_mode="disabled")
     _, info = env.reset(seed=0)
     seeds = info["episode_seed"].tolist()
@@ -166,9 +155,10 @@ def test_a_seed_is_an_episode_of_the_plan(make, settle):
     assert info["margin"] == pytest.approx([results[seed].margin for seed in seeds])
 
 
-def test_autoreset_plays_the_plan_as_a_rollout_does(make):
+def test_autoreset_plays_the_plan_as_a_rollout_does(make, watched_worlds):
     """SAME_STEP: worlds take the next episodes in the order in which they end; every tick is a rollout's."""
-    hashes, results = rollout("football", 5, 2, get("stand"), max_steps=8)
+    hashes, played = watched_rollout(watched_worlds, "football", 5, 2, get("stand"), max_steps=8)
+    results = {result.episode.episode_seed: result for result in played}
     env = make("football", max_episode_steps=8)
     env.reset(seed=0)
     ended = {}
@@ -222,26 +212,21 @@ def test_an_ended_world_is_frozen(make):
     assert not terminated.any() and info["steps"].tolist() == [1, tick + 2]
 
 
+@pytest.mark.parametrize("settle", gym.SETTLE)
 @pytest.mark.parametrize(
-    ("engine", "tracker", "ticks", "settle"),
-    [
-        ("mujoco", "twist2", 20, "steps"),
-        ("mujoco", "twist2", 20, "reset"),
-        ("mujoco", "sonic", 20, "steps"),
-        ("mujoco", "sonic", 20, "reset"),
-        ("warp", "twist2", 3, "reset"),  # slow on the CPU: a few ticks, in the stricter case
-    ],
+    ("engine", "tracker", "ticks"), [("mujoco", "twist2", 10), ("mujoco", "sonic", 10), ("warp", "twist2", 2)]
 )
-def test_resetting_one_world_changes_no_bit_of_another(make, engine, tracker, ticks, settle):
+def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine, tracker, ticks, settle):
     """World 1 goes through the same states whether world 0 is reset (start-up included) or not."""
     env = make("football", engine=engine, tracker=tracker, settle=settle)
+    monkeypatch.setattr(env.env, "startup_ticks", ticks)
     runs = []
     for disturbed in (False, True):
         WatchedEnv.history.clear()
         _, info = env.reset(seed=0)
         seed = info["episode_seed"][1]
         if settle == "steps":
-            for _ in range(40):
+            for _ in range(ticks):
                 env.step(stand(env))
         for tick in range(ticks):
             env.step(wild(tick, [True, False]))
@@ -252,7 +237,7 @@ def test_resetting_one_world_changes_no_bit_of_another(make, engine, tracker, ti
         for _ in range(ticks):
             observation, *_ = env.step(stand(env))
         runs.append((list(WatchedEnv.history[seed]), observation["agent_pos"][1].tobytes()))
-    assert runs[0] == runs[1] and len(runs[0][0]) == 2 * ticks + (40 if settle == "steps" else 50)
+    assert runs[0] == runs[1] and len(set(runs[0][0])) == 3 * ticks
 
 
 def test_a_fall_in_the_start_up(make, monkeypatch):

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import subprocess
 import sys
 
 import numpy as np
@@ -16,18 +15,15 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.scripts import lerobot_eval
 from lerobot.scripts.lerobot_eval import eval_main
-from watched import Table, WatchedEnv
+from watched import WatchedEnv, watched_rollout
 
-from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters import gym
 from arena_newton.eval.adapters.gym import ArenaVectorEnv
 from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
-from arena_newton.eval.plan import episode_plan
 from arena_newton.pictures.settings import CameraConfig
-from arena_newton.policies import Chunk, Policy, get
+from arena_newton.policies import Chunk, Policy
 from arena_newton.robot.canonical import STAND_ACTION
-from arena_newton.rollout import Rollout
 
 PLUGIN = "--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env"
 SIDE = 64
@@ -37,9 +33,9 @@ CHUNK = 5
 
 
 @pytest.fixture(autouse=True)
-def watched(monkeypatch):
-    """Every environment of these tests keeps the hashes of its ticks."""
-    monkeypatch.setattr(gym, "ArenaEnv", WatchedEnv)
+def watched(monkeypatch, watched_worlds):
+    """Every environment of these tests keeps the hashes of its ticks, and is built once."""
+    monkeypatch.setattr(gym, "ArenaEnv", watched_worlds)
     WatchedEnv.history.clear()
 
 
@@ -98,19 +94,6 @@ def as_it_is(batch):
     return batch
 
 
-def rollout(task, count, policy, recorder=(), max_steps=None):
-    """Play the first episodes of the plan in one batch; hashes by episode seed, and results in the plan's order."""
-    camera = policy.camera if policy.needs_image else None
-    env = WatchedEnv(task, tracker=trackers.get("twist2"), worlds=count, engine="mujoco", device="cpu", camera=camera)
-    WatchedEnv.history.clear()
-    episodes = episode_plan.expand([task], trackers=["twist2"], policy="test", seeds=[0], repeats=count)
-    results = Rollout(env, policy, episodes, recorder=recorder, max_steps=max_steps).run()
-    hashes = dict(WatchedEnv.history)
-    WatchedEnv.history.clear()
-    env.close()
-    return hashes, results
-
-
 def evaluate(monkeypatch, checkpoint, out, task, *flags, episodes=2):
     """What LeRobot's command line wrote of the first episodes."""
     arguments = [PLUGIN, "--env.type=arena_newton", f"--env.task={task}", "--env.engine=mujoco", "--env.device=cpu"]
@@ -122,10 +105,9 @@ def evaluate(monkeypatch, checkpoint, out, task, *flags, episodes=2):
     return json.loads((out / "eval_info.json").read_text())
 
 
-def test_an_experts_actions_succeed_as_in_our_runner(monkeypatch, checkpoint, tmp_path):
+def test_an_experts_actions_succeed_as_in_our_runner(monkeypatch, checkpoint, boxed, tmp_path):
     """A LeRobot policy that plays the expert's actions: LeRobot counts the same successes, every tick is the same."""
-    table = Table()
-    hashes, results = rollout("boxing", 2, get("expert"), table)
+    table, hashes, results = boxed
     ticks = {"now": 0}
 
     def select_action(self, batch, **options):
@@ -146,9 +128,9 @@ def test_an_experts_actions_succeed_as_in_our_runner(monkeypatch, checkpoint, tm
     assert len(list((tmp_path / "videos" / "boxing_0").glob("*.mp4"))) == 2
 
 
-def test_a_network_decides_as_in_our_runner(monkeypatch, checkpoint, tmp_path):
+def test_a_network_decides_as_in_our_runner(monkeypatch, checkpoint, watched_worlds, tmp_path):
     """A random ACT, chunks and pictures included: every tick is the same; LeRobot's own recording has our columns."""
-    hashes, results = rollout("football", 2, NetworkPolicy(checkpoint), max_steps=23)
+    hashes, results = watched_rollout(watched_worlds, "football", 2, 2, NetworkPolicy(checkpoint), max_steps=23)
     assert len({result.margin for result in results}) == 2
     flags = "--env.episode_length=23", "--eval.recording=true"
     info = evaluate(monkeypatch, checkpoint, tmp_path, "football", *flags)
@@ -160,7 +142,7 @@ def test_a_network_decides_as_in_our_runner(monkeypatch, checkpoint, tmp_path):
     assert recorded[0]["task"] == "Kick the soccer ball into the goal."
 
 
-def test_falls_end_and_freeze(monkeypatch, checkpoint, tmp_path):
+def test_falls_end_and_freeze(monkeypatch, checkpoint, watched_worlds, tmp_path):
     """Wild actions: worlds fall at different ticks as in our runner, and a fallen world moves no more."""
     wild = np.random.default_rng(1).normal(size=(2, 200, 40)).astype(np.float32)
 
@@ -170,7 +152,7 @@ def test_falls_end_and_freeze(monkeypatch, checkpoint, tmp_path):
         def act(self, observation):
             return Chunk(wild)
 
-    hashes, results = rollout("football", 2, Wild())
+    hashes, results = watched_rollout(watched_worlds, "football", 2, 2, Wild())
     assert [result.outcome for result in results] == ["fall"] * 2
     ticks = {"now": 0}
 
@@ -228,11 +210,3 @@ def test_what_a_rollout_asks():
     assert np.array_equal(observation["agent_pos"], observation["observation.state"])
     assert [picture.shape for picture in batch.call("render")] == [(32, 32, 3)] * 2
     batch.close()
-
-
-def test_the_plug_in_is_light():
-    """Its import loads neither physics nor renderer, so that LeRobot's help and checks do not wait for them."""
-    heavy = {"warp", "newton", "mujoco", "pxr"}
-    code = f"import sys, arena_newton.eval.adapters.lerobot_env; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "set()", done.stderr

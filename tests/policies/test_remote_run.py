@@ -1,6 +1,5 @@
 """Runs with a policy server: what flags reach it, what results are known by, and what no results folder holds."""
 
-import importlib.metadata
 import json
 import threading
 from types import SimpleNamespace
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
+from arena_newton.cli import registry
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import PolicyUnavailable
@@ -150,7 +150,7 @@ def test_example_server_with_pictures(monkeypatch):
 def test_entry_points_and_options(monkeypatch):
     """A package's policy is found; one that is called like another, or makes none, is one line."""
     points = []
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    monkeypatch.setattr(registry, "_installed", lambda group, path: points)
 
     def offer(name, factory, package="theirs"):
         points.append(SimpleNamespace(name=name, load=lambda: factory, dist=SimpleNamespace(name=package)))

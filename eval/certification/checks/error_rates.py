@@ -29,7 +29,7 @@ COMPARISONS = 10_000
 """Synthetic comparisons of each case."""
 MOST_TRAINED = 2_000
 """Comparisons of a case of several trainings, which take longer."""
-QUICK_COMPARISONS = 300
+QUICK_COMPARISONS = 100
 """Under --quick."""
 RATES = (0.2, 0.4, 0.6)
 """Success rate of the weaker policies in each synthetic task."""

@@ -103,7 +103,8 @@ def failures(context: Context) -> CheckFinding:
     left_out = [task for task in context.tasks if task not in INTERACTIONS]
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}
-    matrices |= {"all": confusion([pair for found in pairs.values() for pair in found])} if len(tasks) > 1 else {}
+    every = confusion([pair for found in pairs.values() for pair in found])
+    matrices |= {"all": every} if len(tasks) > 1 else {}
     below = [(f"{task}: {text}", shown) for task, matrix in matrices.items() for text, shown in _below(matrix)]
     below += [
         (f"real failures: {' and '.join(one.judges)} agree on {one.same} of {one.failures} ({one.part} numbers)", True)
@@ -111,8 +112,8 @@ def failures(context: Context) -> CheckFinding:
         if one.part != "even" and one.rate < LEAST  # on the even ones thresholds were set
     ]
     verdict: Verdict = "fail" if any(shown for _, shown in below) else "note" if below else "pass"
-    failed = sum(matrices[list(matrices)[-1]].counts.values())
-    right = sum(matrices[list(matrices)[-1]].counts.get((stage, stage), 0) for stage in FailureStage)
+    failed = sum(every.counts.values())
+    right = sum(every.counts.get((stage, stage), 0) for stage in FailureStage)
     rates = ", ".join(f"{one.rate:.2f} {' with '.join(one.judges)}" for one in agreements(real) if one.part == "all")
     summary = (
         f"{right} of {failed} scripted failures get their stage ({total} episodes); of {len(real)} real ones judged by "

@@ -41,12 +41,19 @@ SHOWN = 2
 """Film strips of each task that the page shows."""
 
 
+def _cell(context: Context, task: str, tracker: str, body: str) -> CertifyCell:
+    """Episodes of a body, which last as long as their budgets: one under --quick, unless more are asked for."""
+    options = context.options
+    episodes = 1 if options.quick and options.episodes is None else context.episodes
+    return CertifyCell(task, tracker, body=body, strip=True, episodes=episodes)
+
+
 def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Table, tuple[Picture, ...]]:
     """Successes of the experts with a body by task, the table of them, and pictures of those successes."""
     rows, pictures, found = [], [], {}
     for tracker in context.sample:
         for task in context.tasks:
-            cell = CertifyCell(task, tracker, body=body, strip=True)
+            cell = _cell(context, task, tracker, body)
             whole, records = score(context.evaluate(recorded(context, task, tracker))), context.evaluate(cell)
             one = score(records)
             found[task] = found.get(task, 0) + one.successes
@@ -64,7 +71,7 @@ def _broken(context: Context, body: str) -> tuple[str, ...]:
     """Why zero successes would say nothing: episodes ended as errors, or nobody solves the task with legs either."""
     said = []
     for tracker, task in itertools.product(context.sample, context.tasks):
-        records = context.evaluate(CertifyCell(task, tracker, body=body, strip=True))
+        records = context.evaluate(_cell(context, task, tracker, body))
         errors = sum(record.outcome == "error" for record in records)
         said += [f"{task} through {tracker}: {errors} episodes ended as errors"] * bool(errors)
         if not score(context.evaluate(recorded(context, task, tracker))).successes:
@@ -77,8 +84,9 @@ def frozen(context: Context) -> CheckFinding:
     found, sheet, pictures = _without_legs(context, "frozen")
     solved = {task: count for task, count in found.items() if count}
     broken = _broken(context, "frozen")
-    total = len(context.sample) * len(context.tasks) * context.episodes
-    summary = f"{sum(found.values())} successes in {total} episodes with the legs frozen in the standing posture"
+    cells = [_cell(context, task, tracker, "frozen") for task in context.tasks for tracker in context.sample]
+    total = counted(sum(cell.episodes or 0 for cell in cells), "episode")
+    summary = f"{sum(found.values())} successes in {total} with the legs frozen in the standing posture"
     notes = tuple(f"{task}: {count} successes with frozen legs, see the pictures" for task, count in solved.items())
     return CheckFinding("fail" if solved or broken else "pass", summary, (sheet,), (*broken, *notes), pictures)
 

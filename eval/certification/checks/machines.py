@@ -33,8 +33,8 @@ __all__ = ["CHECKS", "RayRun", "compared", "play_by_ray", "plan_of"]
 
 EPISODES = 6
 """Episodes of each task and tracker of the plan."""
-QUICK_TASKS = 2
-"""Tasks of the plan under --quick: the last ones, whose episodes are short."""
+QUICK_TASKS = 1
+"""Tasks of the plan under --quick: the last one, whose episodes are short."""
 SHARDS = 3
 """Parts of the plan. Each plays other numbers of worlds: as many as its number."""
 ACTORS = 2
