@@ -19,14 +19,9 @@ from arena_newton.eval.tables import table_text
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import paper_numbers, published, read_paper
 from arena_newton.eval.tables.suite_tables import suite_tables
-from arena_newton.eval.tables.table_entries import (
-    SEMANTIC_STRENGTH,
-    SuiteTable,
-    interval_text,
-    probability,
-    semantic_text,
-)
+from arena_newton.eval.tables.table_entries import SuiteTable, interval_text, probability
 from arena_newton.pages.tables import points
+from arena_newton.tasks.semantic_mode import semantic_note
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +112,7 @@ def test_semantic_numbers_say_what_was_changed(tables):
     assert {"Football (texture)", "P&PBox (clutter)"} <= set(tables["in_gmt_semantic"].head)
     for name, table in tables.items():
         semantic = name in ("in_gmt_semantic", "perturbation")
-        assert (SEMANTIC_STRENGTH in table.caption) == (semantic_text() in table.caption) == semantic, name
+        assert (semantic_note() in table.caption) == semantic, name
 
 
 @pytest.mark.parametrize(
