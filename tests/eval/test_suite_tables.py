@@ -19,7 +19,7 @@ from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.statistics.stats import contrast, holm, mcnemar, wilson
 from arena_newton.eval.tables import table_text
 from arena_newton.eval.tables.evaluated_cells import read_cells
-from arena_newton.eval.tables.paper_numbers import paper_numbers, published
+from arena_newton.eval.tables.paper_numbers import paper_numbers, published, read_paper
 from arena_newton.eval.tables.suite_tables import suite_tables
 from arena_newton.eval.tables.table_entries import SuiteTable, interval_text, probability
 from arena_newton.pages.tables import points
