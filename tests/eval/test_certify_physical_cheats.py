@@ -6,6 +6,7 @@
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,11 +27,23 @@ def certified(folder, check, task):
     return certify.run(options, checks=[one for one in certify.CHECKS if one.name == check])
 
 
+PLAN = closed_forms._plan
+
+
+@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_both_engines_are_measured(engine, quick):
+    """Closed forms are measured in every task on the episodes' engine, and at least in the first on the other one."""
+    given = SimpleNamespace(options=SimpleNamespace(quick=quick), tasks=("football", "boxing"), trackers=("twist2",))
+    found = [(row[0], row[2]) for row in PLAN(given, (engine, "cpu")) if row[4]]
+    assert {(engine, "football"), (engine, "boxing")} < set(found)
+    assert ({"mujoco": "warp", "warp": "mujoco"}[engine], "football") in found
+
+
 @pytest.fixture(autouse=True)
 def one_engine(monkeypatch):
     """Closed forms on engine mujoco alone: Warp's CPU backend takes half a minute."""
-    plan = closed_forms._plan
-    monkeypatch.setattr(closed_forms, "_plan", lambda *given: [one for one in plan(*given) if one[0] == "mujoco"])
+    monkeypatch.setattr(closed_forms, "_plan", lambda *given: [one for one in PLAN(*given) if one[0] == "mujoco"])
 
 
 def compiled(monkeypatch, change):
