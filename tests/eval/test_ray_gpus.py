@@ -48,10 +48,12 @@ CREW = """
 import sys
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.worker_pool import WorkerPool, in_cluster
+from arena_newton.eval.workers.backend import backend_of
+from arena_newton.eval.workers.worker_pool import WorkerPool
 address, gpus, number = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
-with in_cluster((address,)):
-    pool = WorkerPool(resolve(RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)
+flags = RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)
+with backend_of(flags, resolve(flags).device) as backend:
+    pool = WorkerPool(backend, 8, None)
     while len(pool.idle()) < number:
         list(pool.messages())
     print(len(pool.workers), *sorted(worker.node.gpus for worker in pool.workers))
