@@ -19,10 +19,9 @@ from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_run import CellPlayer
-from arena_newton.eval.workers.backend import backend_of
 from arena_newton.eval.workers.dealing import DealtRun
 from arena_newton.eval.workers.slice_events import Done, Event, Opened
-from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool
+from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 
 __all__ = ["run"]
 

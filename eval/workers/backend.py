@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
-from arena_newton.eval.plan.options import Workers
 from arena_newton.eval.workers.slice_events import Done, Event, Node, Opened
 
-__all__ = ["Backend", "Process", "WorkerLost", "backend_of"]
+__all__ = ["PoolBackend", "Process", "WorkerLost"]
 
 
 class WorkerLost(Exception):
@@ -39,8 +36,8 @@ class Process(Protocol):
         """End the process at once; it may have ended."""
 
 
-class Backend(Protocol):
-    """Where processes come from."""
+class PoolBackend(Protocol):
+    """Source of processes."""
 
     flag: str
     """The flag that asks for it, as it is typed."""
@@ -53,7 +50,7 @@ class Backend(Protocol):
         """Processes that there is room for now."""
 
     def demand(self) -> str:
-        """What each process asks for, for a reader who waits for the first one."""
+        """Needs of each process, for a reader who waits for the first one."""
 
     def cores(self, rank: int) -> tuple[int, int]:
         """First core and number of cores of the process of a machine that has this number, from 0."""
@@ -63,26 +60,3 @@ class Backend(Protocol):
 
     def wait(self, processes: Sequence[Process], timeout: float) -> Sequence[Process]:
         """Those that have answered or ended; waits for the first one, so long at most [s]."""
-
-
-@contextlib.contextmanager
-def backend_of(flags: Workers, device: str) -> Iterator[Backend]:
-    """Processes that flags ask for.
-
-    Args:
-        flags: The flags, checked.
-        device: Device of the runs.
-
-    Raises:
-        InputError: No cluster answers, or it has no room.
-    """
-    if flags.ray is None:
-        from arena_newton.eval.workers.local_backend import LocalBackend
-
-        yield LocalBackend(flags.jobs, device)
-        return
-    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"  # read on import: each process would be another `uv run`
-    from arena_newton.eval.workers.ray_backend import RayBackend, in_cluster
-
-    with in_cluster(flags.ray):
-        yield RayBackend(flags, device)

@@ -31,9 +31,9 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.backend import Backend, backend_of
+from arena_newton.eval.workers.backend import PoolBackend
 from arena_newton.eval.workers.slice_events import Built, Done, Ended, Event, Opened, Ticks
-from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool
+from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 from arena_newton.files.text import plain_text
 from arena_newton.robot.g1 import TICK
 
@@ -72,7 +72,7 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         return run_and_report(folder, beside, lambda one: _played(backend, one, factories))
 
 
-def _played(backend: Backend, folder: ResultsFolder, factories: Factories | None) -> bool:
+def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | None) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
     pool, job = WorkerPool(backend, len(folder.config.episodes), factories), Job(folder)
     resume = f"{command(folder, 'resume')} {backend.flag}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -20,7 +21,7 @@ from arena_newton.eval.play.run_flow import Group, RunStopped
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.backend import Backend, Process, WorkerLost
+from arena_newton.eval.workers.backend import PoolBackend, Process, WorkerLost
 from arena_newton.eval.workers.slice_events import Broke, Done, Event, Node, Opened, Slice
 from arena_newton.files.text import counted, plain_text
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
 
-__all__ = ["Assignment", "Job", "Lost", "Worker", "WorkerPool"]
+__all__ = ["Assignment", "Job", "Lost", "Worker", "WorkerPool", "backend_of"]
 
 BEGINNING = 600.0
 """A process has at least this time to build tracker and policy, whatever a slice has [s]."""
@@ -126,10 +127,33 @@ class Worker:
     """Monotonic time from which it is replaced when it was lost [s]."""
 
 
+@contextlib.contextmanager
+def backend_of(flags: Workers, device: str) -> Iterator[PoolBackend]:
+    """Processes that flags ask for.
+
+    Args:
+        flags: The flags, checked.
+        device: Device of the runs.
+
+    Raises:
+        InputError: No cluster answers, or it has no room.
+    """
+    if flags.ray is None:
+        from arena_newton.eval.workers.local_backend import LocalBackend
+
+        yield LocalBackend(flags.jobs, device)
+        return
+    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"  # read on import: each process would be another `uv run`
+    from arena_newton.eval.workers.ray_backend import RayBackend, in_cluster
+
+    with in_cluster(flags.ray):
+        yield RayBackend(flags, device)
+
+
 class WorkerPool:
     """Processes that play one run, or several with the same flags on the same kind of device."""
 
-    def __init__(self, backend: Backend, most: int, factories: Factories | None):
+    def __init__(self, backend: PoolBackend, most: int, factories: Factories | None):
         """Start them.
 
         Args:

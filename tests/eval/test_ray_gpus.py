@@ -48,8 +48,7 @@ CREW = """
 import sys
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.backend import backend_of
-from arena_newton.eval.workers.worker_pool import WorkerPool
+from arena_newton.eval.workers.worker_pool import WorkerPool, backend_of
 address, gpus, number = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 flags = RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)
 with backend_of(flags, resolve(flags).device) as backend:
