@@ -1,4 +1,4 @@
-"""`eval matrix --ray`: one pool plays the cells of a suite, several at once; what is lost is played again.
+"""`eval matrix --ray` and `--jobs`: one pool plays the cells of a suite, several at once; what is lost is played again.
 
 Processes are objects of this process, which answer in turn; a test says when one dies.
 """
@@ -23,10 +23,10 @@ from arena_newton.eval.workers.shard_merge import merge
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.suites import ray_suite  # noqa: E402
-from arena_newton.eval.workers import ray_run, worker_pool  # noqa: E402
-from arena_newton.eval.workers.ray_actor import EpisodeActor  # noqa: E402
-from arena_newton.eval.workers.slice_events import Node  # noqa: E402
+from arena_newton.eval.workers import local_backend, ray_backend, worker_pool  # noqa: E402
+from arena_newton.eval.workers.actor import EpisodeActor  # noqa: E402
+from arena_newton.eval.workers.backend import WorkerLost  # noqa: E402
+from arena_newton.eval.workers.slice_events import Done, Node  # noqa: E402
 
 
 class Answer:
@@ -51,7 +51,7 @@ class InlineRay:
 
     def _actor(self, gpu):
         self.actors += 1
-        actor, number = EpisodeActor(gpu=True), self.actors
+        actor, number = EpisodeActor(), self.actors
 
         def opening(options, folder, cores, made_of):
             self.opened.append((number, folder))
@@ -76,6 +76,7 @@ class InlineRay:
         self.killed += 1
 
 
+<<<<<<< HEAD
 def stand_in(patch, dies=lambda: False, cores=2.0):
     """Put a stand-in with so many cores in Ray's place."""
     found = InlineRay(dies, cores)
@@ -84,12 +85,50 @@ def stand_in(patch, dies=lambda: False, cores=2.0):
     for module in (ray_run, ray_suite):
         patch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
     return found
+=======
+class InlineProcess:
+    """A process of --jobs, whose answers are those of an actor of `InlineRay`."""
+
+    def __init__(self, fake, gpu):
+        self.fake, self.gpu, self.runs, self.pipe, self.actor = fake, gpu, True, self, fake._actor(gpu)
+
+    def ask(self, method, *arguments):
+        called = getattr(self.actor, method)
+        self.answers = called.options("streaming").remote(*arguments) if method == "play" else None
+        self.answer = called.remote(*arguments) if method != "play" else None
+
+    def take(self):
+        answer = self.answer if self.answers is None else next(self.answers, None)
+        if self.fake.dies():
+            raise WorkerLost
+        return Done() if answer is None else answer.work()
+
+    def end(self):
+        self.runs = False
+        self.fake.killed += 1
+>>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
 
 
 @pytest.fixture
 def inline(monkeypatch):
+<<<<<<< HEAD
     """Makes a stand-in for Ray."""
     return functools.partial(stand_in, monkeypatch)
+=======
+    """Makes a stand-in for processes, of Ray or of --jobs."""
+
+    def make(dies=lambda: False, cores=2.0):
+        found = InlineRay(dies, cores)
+        monkeypatch.setattr(ray_backend, "ray", found)
+        monkeypatch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
+        monkeypatch.setattr(local_backend, "LocalProcess", lambda gpu: InlineProcess(found, gpu))
+        monkeypatch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
+        monkeypatch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
+        monkeypatch.setenv("OMP_NUM_THREADS", "2")
+        return found
+
+    return make
+>>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
 
 
 @pytest.fixture
@@ -109,9 +148,12 @@ def alone(tmp_path_factory):
     return folder / "out"
 
 
-def call(suite, out, *flags, **changes):
-    """Exit code of `eval matrix --ray` with processes of one core."""
-    command = ["matrix", str(suite), "--out", str(out), "--ray", "--ray-cpus", "1", *flags]
+RAY, JOBS = ("--ray", "--ray-cpus", "1"), ("--jobs", "2")
+
+
+def call(suite, out, *flags, by=RAY, **changes):
+    """Exit code of `eval matrix` with processes of one core."""
+    command = ["matrix", str(suite), "--out", str(out), *by, *flags]
     return main(command, factories(**changes))
 
 
@@ -124,6 +166,7 @@ def merged(out, target):
     return found
 
 
+<<<<<<< HEAD
 @pytest.fixture(scope="module")
 def undisturbed(alone):
     """Folder of the suite that two processes played without any loss, and the stand-in for Ray."""
@@ -138,6 +181,15 @@ def test_the_same_bytes_as_without(undisturbed, alone, tmp_path):
     out, _ = undisturbed
     assert merged(out, tmp_path / "a") == merged(alone, tmp_path / "b")
     found, wanted = read_suite(out), read_suite(alone)
+=======
+@pytest.mark.parametrize("by", [RAY, JOBS], ids=["ray", "jobs"])
+def test_the_same_bytes_as_without(inline, suite, alone, tmp_path, by):
+    """Journals, tables and reports of all cells are those of one process, and suite.json says the same of them."""
+    inline()
+    assert call(suite, tmp_path / "out", by=by) == 0
+    assert merged(tmp_path / "out", tmp_path / "a") == merged(alone, tmp_path / "b")
+    found, wanted = read_suite(tmp_path / "out"), read_suite(alone)
+>>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
     for mine, its in zip(found.cells, wanted.cells, strict=True):
         assert (mine.id, mine.config, mine.status, mine.finished, mine.successes, mine.device) == (
             (its.id, its.config, "done", 4, its.successes, "cpu")
@@ -159,12 +211,19 @@ def test_one_crew_for_all_cells(undisturbed):
     assert changes <= 4, groups
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("every", [5, 11])
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every):
+=======
+@pytest.mark.parametrize(
+    ("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (7, JOBS), (11, RAY), (17, JOBS)], ids=str
+)
+def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
+>>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)
     fake = inline(lambda: next(count) % every == 0)
-    assert call(suite, tmp_path / "out", "--ray-attempts", "99") == 0
+    assert call(suite, tmp_path / "out", by=by) == 0
     assert journals(tmp_path / "out") == journals(alone)
     assert fake.killed > 2
 
