@@ -48,27 +48,16 @@ CREW = """
 import functools, ray
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-<<<<<<< HEAD
-from arena_newton.eval.workers.worker_pool import WorkerPool, in_cluster
+from arena_newton.eval.workers.worker_pool import WorkerPool, backend_of
 ray.init = functools.partial(ray.init, num_cpus=4, num_gpus=2)
-with in_cluster(()):
-    for gpus, number in ((1, 2), (0.5, 4)):
-        pool = WorkerPool(resolve(RunOptions(ray=(), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)
+for gpus, number in ((1, 2), (0.5, 4)):
+    flags = RunOptions(ray=(), engine="warp", ray_cpus=1, ray_gpus=gpus)
+    with backend_of(flags, resolve(flags).device) as backend:
+        pool = WorkerPool(backend, 8, None)
         while len(pool.idle()) < number:
             list(pool.messages())
         print(len(pool.workers), *sorted(worker.node.gpus for worker in pool.workers))
         pool.dismiss()
-=======
-from arena_newton.eval.workers.worker_pool import WorkerPool, backend_of
-address, gpus, number = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
-flags = RunOptions(ray=(address,), engine="warp", ray_cpus=1, ray_gpus=gpus)
-with backend_of(flags, resolve(flags).device) as backend:
-    pool = WorkerPool(backend, 8, None)
-    while len(pool.idle()) < number:
-        list(pool.messages())
-    print(len(pool.workers), *sorted(worker.node.gpus for worker in pool.workers))
-    pool.dismiss()
->>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
 """
 """A program that asks for processes and says which GPUs they see."""
 

@@ -76,16 +76,6 @@ class InlineRay:
         self.killed += 1
 
 
-<<<<<<< HEAD
-def stand_in(patch, dies=lambda: False, cores=2.0):
-    """Put a stand-in with so many cores in Ray's place."""
-    found = InlineRay(dies, cores)
-    patch.setattr(worker_pool, "ray", found)
-    patch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
-    for module in (ray_run, ray_suite):
-        patch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
-    return found
-=======
 class InlineProcess:
     """A process of --jobs, whose answers are those of an actor of `InlineRay`."""
 
@@ -106,29 +96,24 @@ class InlineProcess:
     def end(self):
         self.runs = False
         self.fake.killed += 1
->>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
+
+
+def stand_in(patch, dies=lambda: False, cores=2.0):
+    """Put stand-ins for processes, of Ray and of --jobs, in their place."""
+    found = InlineRay(dies, cores)
+    patch.setattr(ray_backend, "ray", found)
+    patch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
+    patch.setattr(local_backend, "LocalProcess", lambda gpu: InlineProcess(found, gpu))
+    patch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
+    patch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
+    patch.setenv("OMP_NUM_THREADS", "2")
+    return found
 
 
 @pytest.fixture
 def inline(monkeypatch):
-<<<<<<< HEAD
-    """Makes a stand-in for Ray."""
+    """Makes stand-ins for processes."""
     return functools.partial(stand_in, monkeypatch)
-=======
-    """Makes a stand-in for processes, of Ray or of --jobs."""
-
-    def make(dies=lambda: False, cores=2.0):
-        found = InlineRay(dies, cores)
-        monkeypatch.setattr(ray_backend, "ray", found)
-        monkeypatch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
-        monkeypatch.setattr(local_backend, "LocalProcess", lambda gpu: InlineProcess(found, gpu))
-        monkeypatch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
-        monkeypatch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
-        monkeypatch.setenv("OMP_NUM_THREADS", "2")
-        return found
-
-    return make
->>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
 
 
 @pytest.fixture
@@ -166,7 +151,6 @@ def merged(out, target):
     return found
 
 
-<<<<<<< HEAD
 @pytest.fixture(scope="module")
 def undisturbed(alone):
     """Folder of the suite that two processes played without any loss, and the stand-in for Ray."""
@@ -176,20 +160,15 @@ def undisturbed(alone):
         return out, fake
 
 
-def test_the_same_bytes_as_without(undisturbed, alone, tmp_path):
+@pytest.mark.parametrize("by", [RAY, JOBS], ids=["ray", "jobs"])
+def test_the_same_bytes_as_without(inline, undisturbed, suite, alone, tmp_path, by):
     """Journals, tables and reports of all cells are those of one process, and suite.json says the same of them."""
-    out, _ = undisturbed
+    out = undisturbed[0] if by is RAY else tmp_path / "out"
+    if by is JOBS:
+        inline()
+        assert call(suite, out, by=by) == 0
     assert merged(out, tmp_path / "a") == merged(alone, tmp_path / "b")
     found, wanted = read_suite(out), read_suite(alone)
-=======
-@pytest.mark.parametrize("by", [RAY, JOBS], ids=["ray", "jobs"])
-def test_the_same_bytes_as_without(inline, suite, alone, tmp_path, by):
-    """Journals, tables and reports of all cells are those of one process, and suite.json says the same of them."""
-    inline()
-    assert call(suite, tmp_path / "out", by=by) == 0
-    assert merged(tmp_path / "out", tmp_path / "a") == merged(alone, tmp_path / "b")
-    found, wanted = read_suite(tmp_path / "out"), read_suite(alone)
->>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
     for mine, its in zip(found.cells, wanted.cells, strict=True):
         assert (mine.id, mine.config, mine.status, mine.finished, mine.successes, mine.device) == (
             (its.id, its.config, "done", 4, its.successes, "cpu")
@@ -211,15 +190,8 @@ def test_one_crew_for_all_cells(undisturbed):
     assert changes <= 4, groups
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("every", [5, 11])
-def test_losses_lose_nothing(inline, suite, alone, tmp_path, every):
-=======
-@pytest.mark.parametrize(
-    ("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (7, JOBS), (11, RAY), (17, JOBS)], ids=str
-)
+@pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (7, JOBS)], ids=["ray", "jobs"])
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
->>>>>>> 20cb092861c077cad0e3e3e1b5c26eb2b4cb99b1
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)
     fake = inline(lambda: next(count) % every == 0)
