@@ -18,7 +18,7 @@ import warp as wp
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.interfaces import EpisodeEvent, Observation, Spawn, Verdict
-from arena_newton.kernel_cache.kernel_loading import loading
+from arena_newton.kernel_cache.kernel_loading import load_kernels
 from arena_newton.kernels import canonical, reset
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
@@ -92,20 +92,7 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
-        with loading(self.engine, device, camera=camera is not None, suite=self.spec.suite):
-            self._build(tracker, device, variant_file, fast_physics, drive, camera, threads)
-
-    def _build(
-        self,
-        tracker: Tracker,
-        device: str,
-        variant_file: str | None,
-        fast_physics: bool,
-        drive: DriveGains | None,
-        camera: CameraConfig | None,
-        threads: int | None,
-    ) -> None:
-        """Build scene and physics, and bind everything to them."""
+        load_kernels(self.engine, device, camera=camera is not None, suite=self.spec.suite)
         original = tracker.original_drive if self.rules.original_drive else None
         self.drive = drive or original or tracker.drive
         self.scene = load_scene(

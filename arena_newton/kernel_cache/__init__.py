@@ -1,1 +1,1 @@
-"""Compiled kernels: loaded side by side while an environment is built."""
+"""Kernels, compiled and loaded side by side before an environment is built."""

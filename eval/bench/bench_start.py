@@ -43,8 +43,7 @@ def first_tick(task: str, worlds: int, threads: int) -> None:
     Args:
         task: Task.
         worlds: Worlds.
-        threads: Threads that load kernels; 1: one module after the other, when its first kernel is launched. 0: as
-            many as usual.
+        threads: Threads that load kernels; 1: one module after the other. 0: as many as usual.
     """
     quiet_warp()
     if threads:
