@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import importlib.util
 import os
@@ -87,6 +88,12 @@ class Finding:
 
 def versions() -> dict[str, str | None]:
     """Installed versions by distribution name, without importing anything heavy; None for what is absent."""
+    return dict(_versions())
+
+
+@functools.cache
+def _versions() -> dict[str, str | None]:
+    """The same; a process keeps the libraries that it has, and looking takes as long as a short episode."""
     from arena_newton import __version__
 
     found: dict[str, str | None] = {"python": platform.python_version(), "arena-newton": __version__}

@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
+import types
 from pathlib import Path
 
 _SERVER = multiprocessing.get_context("forkserver")
@@ -18,11 +20,13 @@ class Child:
     """A command line in a process of its own; what it prints is kept. Its methods are those of `subprocess.Popen`."""
 
     def __init__(self, module, arguments, **variables):
-        """Call `main` of a module, under these variables besides this process's."""
+        """Call `main` of a module, or the function after its colon, under these variables besides this process's."""
         self._printed = tempfile.TemporaryDirectory()
         streams = [str(Path(self._printed.name, name)) for name in ("out", "err")]
+        for stream in streams:
+            Path(stream).touch()
         given = {"GIVEN": (module, [*arguments], os.environ | variables, streams)}
-        # By its file: the name `tests` is another package's in a process that pytest did not start.
+        # By its file: the name `tests` is none, or another package's, in a process that pytest did not start.
         self._process = _SERVER.Process(target=runpy.run_path, args=(__file__, given, "child"), daemon=True)
         self._process.start()
         self.pid = self._process.pid
@@ -46,6 +50,16 @@ class Child:
     def communicate(self, timeout=None):
         """All that it printed, and its complaints, once it has ended."""
         self.wait(timeout)
+        return self.printed()
+
+    def lines(self, count):
+        """So many lines, or all that it printed before it ended."""
+        while self.returncode is None and self.printed()[0].count("\n") < count:
+            time.sleep(0.02)
+        return self.printed()[0].splitlines()
+
+    def printed(self):
+        """What it has printed so far, and its complaints."""
         return tuple(Path(self._printed.name, name).read_bytes().decode() for name in ("out", "err"))
 
     def send_signal(self, number):
@@ -63,13 +77,16 @@ def _play(module, arguments, variables, streams):
     os.environ.clear()
     os.environ.update(variables)
     for number, (name, path) in enumerate(zip(("stdout", "stderr"), streams, strict=True), start=1):
-        file = os.open(path, os.O_WRONLY | os.O_CREAT)
+        file = os.open(path, os.O_WRONLY)
         os.dup2(file, number)
         os.close(file)
         setattr(sys, name, open(number, "w", buffering=1, closefd=False))
     sys.argv = [module, *arguments]
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.exit(importlib.import_module(module).main(arguments))
+    sys.modules["tests"] = tests = types.ModuleType("tests")
+    tests.__path__ = [str(Path(__file__).parent)]
+    module, _, function = module.partition(":")
+    sys.exit(getattr(importlib.import_module(module), function or "main")(arguments))
 
 
 if __name__ == "child":

@@ -60,11 +60,27 @@ def shared() -> Path:
     return SHARED
 
 
+@pytest.fixture(scope="session", autouse=True)
+def power():
+    """No test takes it away: nobody waits for a disk, which takes milliseconds a line of a journal."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def small_heap():
     """Every evaluation collects garbage; with the objects of all earlier tests that took seconds per call."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_loss_of_power():
+    """Nothing waits for the disk: all files of a test are gone after it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
 
 
 @pytest.fixture(scope="session")

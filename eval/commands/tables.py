@@ -76,7 +76,7 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
     for form, name, text in (
         ("md", "tables.md", table_text.as_markdown(tables, cells.notes)),
         ("tex", "tables.tex", table_text.as_latex(tables, cells.notes)),
-        ("csv", "cells.csv", table_text.as_csv(tables)),
+        ("csv", "cells.csv", table_text.as_csv(tables, bool(cells.changed))),
     ):
         if form in options.format and tables:
             write_atomic(out / name, text)

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import cast
 
 from arena_newton.data.recording.episode import VIDEO_FOLDER
 from arena_newton.eval.folders.results import RunRecord, load_run
@@ -163,7 +164,9 @@ def write(out: Path, options: LoopOptions, command: str) -> list[str]:
     text += ["## Time", "", Table(["stage", "seconds"], stages, "lr").markdown(), "## What was made", ""]
     text += [f"- {escaped(name)}: {escaped(value)}" for name, value in facts]
     if drawn is not None:
-        ends = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in drawn["ends"].items())
+        ends = ", ".join(
+            f"{name.replace('_', ' ')} {value}" for name, value in cast("dict[str, str]", drawn["ends"]).items()
+        )
         text += [f"- last {ends} at step {drawn['last']} (curve: loop.html)"]
     text += ["", "## A success and a failure", ""]
     for record, strips in films:

@@ -36,15 +36,13 @@ from arena_newton.eval.plan.options import (
 )
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.identity import (
-    PACKAGE,
     code_hash,
     config_hash,
     foreign_task,
     hash_path,
-    hash_paths,
     layers_hash,
     own_code,
-    scene_files,
+    scenes_hash,
 )
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
@@ -373,7 +371,7 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_hash=policy_hash,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         variant_hash=variant_hash,
-        scenes_hash=hash_paths(PACKAGE, scene_files(PACKAGE, tasks, task_specs.names())),
+        scenes_hash=scenes_hash(tasks, task_specs.names()),
         code_hash=code_hash(),
         foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
     )

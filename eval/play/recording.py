@@ -23,7 +23,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.run_folder import EPISODES, comparable
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.identity import PACKAGE, hash_paths, moving_versions, scene_files
+from arena_newton.eval.records.identity import moving_versions, scenes_hash
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.text import counted
@@ -69,7 +69,7 @@ def facts_of(
         "checkpoint": config.checkpoint_hashes[tracker],
         "tracker_facts": (config.tracker_facts or {}).get(tracker),
         "rules_hash": rule_sets.get(flags.rules).hash_for((task,)),
-        "scenes": hash_paths(PACKAGE, scene_files(PACKAGE, (task,), task_specs.names())),
+        "scenes": scenes_hash((task,), task_specs.names()),
         "environment": comparable(environment),
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
         **({"foreign_task": config.foreign_tasks[task]} if task in config.foreign_tasks else {}),
@@ -77,10 +77,9 @@ def facts_of(
     }
 
 
-def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -> DemonstrationRecorder | None:
-    """The recorder of an environment; None where nothing is recorded."""
-    if config.recording is None:
-        return None
+def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -> DemonstrationRecorder:
+    """The recorder of an environment of a run that records."""
+    assert config.recording is not None
     return DemonstrationRecorder(
         folder / EPISODES,
         cameras=config.recording,

@@ -320,9 +320,10 @@ class RunPlayer:
                 recorders.append(self.viewer)
             noise = recording.disturbance_of(config, task, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
-            described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
-            files = recording.demonstration_recorder(config, self.folder.path, described)
-            recorders += [] if files is None else [files]
+            if config.recording is not None:
+                described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
+                files = recording.demonstration_recorder(config, self.folder.path, described)
+                recorders.append(files)
 
             def keep(result: EpisodeResult, media: dict[str, str]) -> None:
                 pictures = recorder.media(result.episode) if recorder is not None else {}

@@ -35,6 +35,7 @@ __all__ = [
     "own_code",
     "package_files",
     "scene_files",
+    "scenes_hash",
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
@@ -180,6 +181,12 @@ def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> l
     scenes = root / "usd_scenes"
     found = [file for file in package_files(scenes) if file.suffix not in (".py", ".pyc")]
     return [file for file in found if file.relative_to(scenes).parts[0] not in others]
+
+
+@functools.cache
+def scenes_hash(tasks: tuple[str, ...], known: tuple[str, ...]) -> str:
+    """Hash of the built-in scenes of a run's tasks, taken once in a process, which imports each scene once too."""
+    return hash_paths(PACKAGE, scene_files(PACKAGE, tasks, known))
 
 
 def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str] = hash_path) -> str:

@@ -107,7 +107,7 @@ def _of_csv(path: Path) -> list[EvaluatedCell]:
         cell = _of_row(where, path, row, found)
         found[cell.training, cell.task, cell.tracker, cell.mode] = cell
     if not found:
-        raise InputError(f"{path}: has no cell of ours in the tables in_gmt, cross_gmt or merge_all")
+        raise InputError(f"{path}: has no cell of ours that is a result, in the tables in_gmt, cross_gmt or merge_all")
     return list(found.values())
 
 

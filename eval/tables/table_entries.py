@@ -14,6 +14,7 @@ from arena_newton.eval.tables.paper_numbers import PaperRate, PublishedRow
 from arena_newton.pages.tables import Table, percent
 
 __all__ = [
+    "NO_RESULT",
     "PAPER_NAMES",
     "SEMANTIC_CHANGES",
     "SEMANTIC_STRENGTH",
@@ -45,6 +46,8 @@ SEMANTIC_CHANGES = {
     "clutter": "things that are added in",
 }
 """Change that semantic mode makes → words for it."""
+NO_RESULT = "no result"
+"""Source of numbers of cut step budgets or another scene in a `cells.csv`, of which no finding is made."""
 UNDEFINED = "—"
 """Shown where a number is undefined, such as a retention of nothing."""
 
@@ -55,7 +58,7 @@ class TableEntry:
 
     table: str
     source: str
-    """`ours`, `paper` or `self-reported`."""
+    """`ours`, `paper` or `self-reported`; in a file `NO_RESULT` for ours of a changed run."""
     policy: str
     family: str
     trained_on: str = ""

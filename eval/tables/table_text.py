@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from arena_newton.eval.tables.table_entries import SuiteTable, TableEntry
+from arena_newton.eval.tables.table_entries import NO_RESULT, SuiteTable, TableEntry
 from arena_newton.files.text import plain
 from arena_newton.pages.tables import Table, escaped, latex_text
 
@@ -45,10 +45,17 @@ def as_latex(tables: Sequence[SuiteTable], notes: Sequence[str]) -> str:
     return "\n".join(parts)
 
 
-def as_csv(tables: Sequence[SuiteTable]) -> str:
-    """One line per number, fields of `TableEntry`; fractions in [0, 1], empty where a number is undefined."""
+def as_csv(tables: Sequence[SuiteTable], changed: bool = False) -> str:
+    """One line per number, fields of `TableEntry`; fractions in [0, 1], empty where a number is undefined.
+
+    Args:
+        tables: All tables.
+        changed: Our episodes are no results of the benchmark, which their source says.
+    """
     names = [field.name for field in dataclasses.fields(TableEntry)]
     entries = [entry for table in tables for entry in table.entries]
+    if changed:
+        entries = [dataclasses.replace(e, source=NO_RESULT) if e.source == "ours" else e for e in entries]
     return Table(names, [[_field(getattr(entry, name)) for name in names] for entry in entries]).csv()
 
 

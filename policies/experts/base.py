@@ -6,8 +6,9 @@ the generator turns them into canonical actions. The expert does not know which 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,11 +58,29 @@ class Sight:
             torch.from_numpy(addresses).long().to(self.device)
             for addresses in (env.scene.robot.joint_qpos, env.scene.robot.joint_qvel)
         )
+        self._measured: dict[Hashable, Tensor] | None = None
+
+    @contextlib.contextmanager
+    def still(self) -> Iterator[None]:
+        """Measures everything once only: no world moves while the experts decide."""
+        self._measured = {}
+        try:
+            yield
+        finally:
+            self._measured = None
+
+    def once(self, key: Hashable, measure: Callable[[], Tensor]) -> Tensor:
+        """A measurement that is made once while the worlds are `still`, and otherwise at every call."""
+        if self._measured is None:
+            return measure()
+        if key not in self._measured:
+            self._measured[key] = measure()
+        return self._measured[key]
 
     @property
     def pose(self) -> Tensor:
         """Root x, y [m] and yaw [rad], shape [worlds, 3]."""
-        return torch.cat([self._root[:, :2], heading(self._root[:, 3:7])[:, None]], dim=1)
+        return self.once("pose", lambda: torch.cat([self._root[:, :2], heading(self.root_quat)[:, None]], dim=1))
 
     @property
     def height(self) -> Tensor:
@@ -118,7 +137,7 @@ class Sight:
         """Reader of the current position [m] of a frame prim of the robot or scene, shape [worlds, 3]."""
         frame = self.scene.frame(name)
         offset = torch.tensor(frame.pos, dtype=torch.float32, device=self.device)
-        return lambda: self.point(frame.body_id, offset)
+        return lambda: self.once(("frame", name), lambda: self.point(frame.body_id, offset))
 
     def box(self, prim: str) -> tuple[int, Tensor, Tensor]:
         """Body of a prim's first box collider, the collider's position in its frame [m] and its half sizes [m]."""
@@ -214,6 +233,7 @@ class ExpertPolicy(Policy):
         self._begins = np.ones(env.worlds, dtype=bool)
         self._asked = np.zeros(env.worlds, dtype=np.int64)
         self._commands = MotionCommand.neutral(env.worlds, env.torch_device).pack()
+        self._walking = torch.zeros(env.worlds, dtype=torch.bool, device=env.torch_device)
         self._phases: list[str] | None = None
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
@@ -231,11 +251,11 @@ class ExpertPolicy(Policy):
         worlds, device = len(observation.state), self.sight.device
         asking = world_mask(observation.mask, worlds)
         mask = torch.from_numpy(asking).to(device)
-        self._begin(asking & self._begins)
-        self._decide(asking & (self._asked % DECISION == 0))
+        with self.sight.still():
+            self._begin(asking & self._begins)
+            self._decide(asking & (self._asked % DECISION == 0))
+            self.generator.realign(self.sight.pose[:, 2], REALIGN * (mask & self._walking))
         self._asked[asking] += 1
-        walking = (self._commands[:, COLUMNS["velocity"]] != 0).any(dim=1)
-        self.generator.realign(self.sight.pose[:, 2], REALIGN * (mask & walking))
         self.generator.step(self._commands, mask)
         return Chunk(self.generator.action()[:, None], phases=self._phases)
 
@@ -256,6 +276,7 @@ class ExpertPolicy(Policy):
         mask = torch.from_numpy(deciding).to(self.sight.device)
         command = self.expert.command(mask, DECISION * TICK)
         self._commands = torch.where(mask[:, None], command.pack(), self._commands)
+        self._walking = (self._commands[:, COLUMNS["velocity"]] != 0).any(dim=1)
         phases = self.expert.phases()
         if phases is not None and self._phases is not None:
             # Of a world that does not decide now the expert may name the phase that its next decision begins.

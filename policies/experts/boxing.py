@@ -16,6 +16,7 @@ of a shoulder, and the hand passes next to the bag.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -202,17 +203,17 @@ class BoxingExpert(Expert):
         answer = self._walk.command(mask & ~waiting & ~striking, dt)
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = paced(answer.velocity, self._pace) * ~waiting[:, None]
-        command.velocity = select(striking, self._steps(), command.velocity)
+        if self._phases.present("strike"):
+            command.velocity = select(striking, self._steps(), command.velocity)
         command.hands = torch.ones_like(command.hands)
         command.waist[:, 0] = self._gaze() * ~waiting
         self._strike(command, striking, mask, dt)
         self._acting = self._phases.names()
 
         self._phases.advance(mask, dt)
-        going = [self._phases.at(name) for name in ("approach", "go round", "step up")]
         approaching, rounding, stepping = (
-            mask & at & (passing(answer, within) | self._phases.late)
-            for at, within in zip(going, (COME_WITHIN, READY_WITHIN, STAND_WITHIN), strict=True)
+            self._phases.over(name, mask, functools.partial(passing, answer, within))
+            for name, within in (("approach", COME_WITHIN), ("go round", READY_WITHIN), ("step up", STAND_WITHIN))
         )
         self._walk.to(approaching, beyond(self._first), Floor(self._boxes, *ROOM))
         self._phases.enter("go round", approaching)
@@ -229,7 +230,9 @@ class BoxingExpert(Expert):
         return self._phases.at("look", *PLACES)
 
     def _look(self, mask: Tensor) -> None:
-        """Count the decisions at which enough of the target is in view."""
+        """Count the decisions at which enough of the target is in view, until it counts as seen."""
+        if not (mask & ~self.seen).any():
+            return
         ball = silhouette(self._eyes.position, self._target(), self._radius, STRIPES)
         glance = self._eyes.sees(ball, self._cylinders).sum(dim=1) >= ENOUGH
         self._glances = self._glances + (mask & glance)
@@ -246,6 +249,8 @@ class BoxingExpert(Expert):
 
     def _search(self, mask: Tensor) -> None:
         """Go on to the next place where the last one has shown nothing."""
+        if not mask.any():
+            return
         near = torch.linalg.vector_norm((self._walk.goal - self.sight.pose)[:, :2], dim=1) < PASSED
         waiting, late = self._phases.at("look"), self._phases.late
         passed = mask & ~waiting & (near | late)
@@ -325,6 +330,8 @@ class BoxingExpert(Expert):
 
     def _step_up(self, mask: Tensor, stand: Tensor) -> None:
         """The last steps, straight to a pose in front of the bag."""
+        if not mask.any():
+            return
         self.stand = select(mask, stand, self.stand)
         self._walk.to(mask, beyond(self.stand))
         self._correction = self._correction.masked_fill(mask[:, None], 0.0)

@@ -17,7 +17,9 @@ what it cannot see (docs/experts.md):
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import torch
@@ -70,6 +72,8 @@ WALKING = ("look", "approach", "step in", "hover", "turn")
 over the hammer while the robot still moves."""
 SIDLING = ("line up", "deliver", "over")
 """Phases that walk to a goal without turning towards it. `over` makes the last steps of `deliver`."""
+BEFORE_WALKING = ("lift", "step back", "back off", "pace", "sill")
+"""Other phases from which a robot may come to one of these."""
 ENDING = ("hover", "over")
 """Those of them that make the last steps, and stand once the robot was `THERE`."""
 GRASPING = ("hover", "lower", "close", "lift")
@@ -228,6 +232,9 @@ class DoubleDeskExpert(Expert):
         self._from = torch.zeros(worlds, 2, device=device)
         self._error = torch.zeros(worlds, 2, device=device)
         self._pairs = torch.arange(3, device=device)
+        self._backwards = torch.tensor([-STEP_BACK[1], 0.0, 0.0], device=device).expand(worlds, 3)
+        self._postures = torch.tensor([LEFT_RAISED, LEFT_CARRY, LEFT_HIGH, RIGHT_RAISED], device=device)
+        """Palms where nothing is grasped [m], heading frame of the pelvis, [4, 3]."""
         self._last = torch.zeros(worlds, 3, device=device)
         self._elapsed = torch.zeros(worlds, device=device)
         self._rolled = torch.zeros(worlds, device=device)
@@ -258,14 +265,16 @@ class DoubleDeskExpert(Expert):
         self._aim(mask & self.machine.at("look", "approach", "step in", "hover"))
         at = self.machine.at
         aside = at(*SIDLING)
-        walking = self.walk.command(mask & at(*WALKING), dt)
+        # A world that begins to walk now does so by the command that it would have had.
+        answer = self.walk.command(mask & at(*WALKING), dt, others=bool(self.machine.present(*BEFORE_WALKING)))
         sidling = self.sidle.command(mask & aside, dt)
-        answer = NavigationCommand(
-            **{
-                field.name: select(aside, getattr(sidling, field.name), getattr(walking, field.name))
-                for field in fields(NavigationCommand)
-            }
-        )
+        if self.machine.present(*SIDLING):
+            answer = NavigationCommand(
+                **{
+                    field.name: select(aside, getattr(sidling, field.name), getattr(answer, field.name))
+                    for field in fields(NavigationCommand)
+                }
+            )
         self._onward(mask, answer)
         self._acting = self.machine.names()
         command = self._act(mask, dt, answer)
@@ -278,6 +287,8 @@ class DoubleDeskExpert(Expert):
 
     def _aim(self, mask: Tensor) -> None:
         """Grasp point on the hammer and heading of the hand, in the worlds of `mask`."""
+        if not mask.any():
+            return
         origin = self._origin()
         handle = torch.nn.functional.normalize((self._mass() - origin)[:, :2], dim=1)
         grasp = torch.cat([origin[:, :2] + ALONG_HANDLE * handle, origin[:, 2:]], dim=1)
@@ -349,29 +360,30 @@ class DoubleDeskExpert(Expert):
     def _onward(self, mask: Tensor, answer: NavigationCommand) -> None:
         """Enter the next phase where one is over."""
         machine, pose, held = self.machine, self.sight.pose, self._held()
-        arrived = {name: passing(answer, within) for name, within in WITHIN.items()}
         self._there = (self._there | (mask & passing(answer, THERE))) & machine.at(*ENDING)
-        back = torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1)
-        wanted, over_crate = self._over()
-        over = arrived | {
-            "look": self._in_view(self._origin()),
-            "hover": (machine.clock > ALIGN) & (self._error[:, 0] < ALIGNED[0]) & (self._error[:, 1] < ALIGNED[1]),
-            "step back": back > STEP_BACK[0],
-            "turn": self._in_view(self._middle()),
-            "sill": self._past_sill(),
-            "over": over_crate & (machine.clock > HOLD),
+        over: dict[str, Callable[[], Tensor]] = {
+            "look": lambda: self._in_view(self._origin()),
+            "hover": lambda: (
+                (machine.clock > ALIGN) & (self._error[:, 0] < ALIGNED[0]) & (self._error[:, 1] < ALIGNED[1])
+            ),
+            "step back": lambda: torch.linalg.vector_norm(pose[:, :2] - self._from, dim=1) > STEP_BACK[0],
+            "turn": lambda: self._in_view(self._middle()),
+            "back off": lambda: pose[:, 1] < self._sill - BEFORE_SILL,
+            "pace": lambda: self._pace()[1] < COMMITTED,
+            "sill": self._past_sill,
+            "over": lambda: self._over()[1] & (machine.clock > HOLD),
         }
-        pace, time = self._pace()
-        over["pace"] = time < COMMITTED
-        over["back off"] = pose[:, 1] < self._sill - BEFORE_SILL
-        late = machine.late
-        done = {name: mask & machine.at(name) & (late | over.get(name, torch.zeros_like(late))) for name in LONGEST}
+        over |= {name: functools.partial(passing, answer, within) for name, within in WITHIN.items()}
+        done = {name: machine.over(name, mask, over.get(name, lambda: machine.late)) for name in LONGEST}
         # A hammer that fell onto the desk is grasped again; one on the floor is out of reach.
         lost = mask & machine.at(*CARRYING) & ~held
+        if not torch.stack([lost, *done.values()]).any():
+            return
         on_desk = self._origin()[:, 2] > BENCH_HEIGHT
         missed = done["lift"] & ~held
         self._aim(missed)
         again = lost & on_desk & (pose[:, 1] < self._sill)
+        (pace, time), (wanted, over_crate) = self._pace(), self._over()
         short = done["over"] & ~over_crate
 
         stand, _ = self._stand()
@@ -412,22 +424,24 @@ class DoubleDeskExpert(Expert):
         at, clock = self.machine.at, self.machine.clock
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = self._velocity(answer.velocity)
-        working = at(*GRASPING)
+        present = self.machine.present
         raised = ~at("look") & (~at("approach") | (answer.distance < RAISE))
 
-        _, short = self._stand()
-        lean = torch.where(working | at("step in"), LEAN + LEAN_MORE * short, 0.0)
+        lean = torch.zeros_like(clock)
+        if present("step in", *GRASPING):
+            lean = torch.where(at("step in", *GRASPING), LEAN + LEAN_MORE * self._stand()[1], lean)
         lean = torch.where(at("over"), (OVER_LEAN + OVER_LEAN_MORE * clock).clamp_max(MOST_LEAN), lean)
         lean = torch.where(at("open"), self._lean, lean)
         self._lean = select(mask, lean, self._lean)
         command.waist[:, 2] = lean
 
-        crossing = at("pace", "sill")
-        command.swing_height = torch.where(crossing, self._style["swing"], command.swing_height)
-        command.step_time = torch.where(crossing, SILL_STEP, command.step_time)
-        command.height = torch.where(crossing, SILL_HEIGHT, command.height)
-        command.stagger = torch.where(at("pace"), PACE_STAGGER, command.stagger)
-        command.stagger = torch.where(at("sill"), SILL_STAGGER, command.stagger)
+        if present("pace", "sill"):
+            crossing = at("pace", "sill")
+            command.swing_height = torch.where(crossing, self._style["swing"], command.swing_height)
+            command.step_time = torch.where(crossing, SILL_STEP, command.step_time)
+            command.height = torch.where(crossing, SILL_HEIGHT, command.height)
+            command.stagger = torch.where(at("pace"), PACE_STAGGER, command.stagger)
+            command.stagger = torch.where(at("sill"), SILL_STAGGER, command.stagger)
 
         command.reach = raised[:, None].expand(-1, 2).to(command.reach.dtype)
         self._lead_hands(command, mask, dt, raised)
@@ -442,13 +456,14 @@ class DoubleDeskExpert(Expert):
         pace = torch.where(at("approach", "line up"), self._style["pace"], 1.0)
         walks = at(*WALKING, *SIDLING) & ~(at(*ENDING) & self._there)
         velocity = walking * pace[:, None] * walks[:, None]
-        # A half turn may go either way.
-        spin = torch.where(self._turns_left, 1.0, -1.0) * velocity[:, 2].abs()
-        far = at("turn") & (wrap_angle(LOOK_LEFT - pose[:, 2]).abs() > 0.6 * math.pi)
-        velocity = torch.cat([velocity[:, :2], torch.where(far, spin, velocity[:, 2])[:, None]], dim=1)
-        back = torch.zeros_like(velocity)
-        back[:, 0] = -STEP_BACK[1]
-        velocity = select(at("step back", "back off"), back, velocity)
+        if self.machine.present("turn"):
+            # A half turn may go either way.
+            spin = torch.where(self._turns_left, 1.0, -1.0) * velocity[:, 2].abs()
+            far = at("turn") & (wrap_angle(LOOK_LEFT - pose[:, 2]).abs() > 0.6 * math.pi)
+            velocity = torch.cat([velocity[:, :2], torch.where(far, spin, velocity[:, 2])[:, None]], dim=1)
+        velocity = select(at("step back", "back off"), self._backwards, velocity)
+        if not self.machine.present("pace", "sill"):
+            return velocity
         crossing = self._crossing()
         line = torch.stack([crossing, torch.full_like(crossing, self._sill)], dim=1)
         north = torch.full_like(crossing, LOOK_LEFT)
@@ -457,43 +472,45 @@ class DoubleDeskExpert(Expert):
 
     def _lead_hands(self, command: MotionCommand, mask: Tensor, dt: float, raised: Tensor) -> None:
         """Fill in hand points and the left wrist."""
-        at, clock, yaw = self.machine.at, self.machine.clock, self.sight.pose[:, 2]
-        working = at(*GRASPING)
-        heading_of_hand = torch.where(working, self._hand_yaw, yaw)
-        hand = quat_multiply(quat_from_yaw(heading_of_hand), self._grasp_quat.expand(len(yaw), 4))
-        above = torch.where(at("hover"), HOVER, 0.0) + torch.where(
-            at("lower"), (HOVER - DESCENT * clock).clamp_min(0.0), 0.0
-        )
-        above = above + torch.where(at("lift"), (ASCENT * clock).clamp_max(LIFTED), 0.0)
-        offset = quat_apply(quat_from_yaw(self._hand_yaw), self._palm_offset.expand(len(yaw), 3))
-        grasping = self._grasp + offset
-        grasping = torch.cat([grasping[:, :2], (grasping[:, 2] + above)[:, None]], dim=1)
-
-        palms = self.palms.measured()
-        posture = torch.tensor([LEFT_RAISED, LEFT_CARRY, LEFT_HIGH, RIGHT_RAISED], device=yaw.device)
+        at, present, yaw = self.machine.at, self.machine.present, self.sight.pose[:, 2]
         style = torch.stack([self._style[f"palm {axis}"] for axis in "xyz"], dim=1)
-        left = select(at("deliver"), posture[2] + style, posture[1] + style)
-        left = select(at("look", "approach", "step in"), posture[0] + style, left)
-        over = self.palms.local((palms[:, 0] + self._over()[0] - self._mass())[:, None])[:, 0]
-        left = select(at("over"), over, left)
-        left = select(working, self.palms.local(grasping[:, None])[:, 0], left)
+        left = select(at("deliver"), self._postures[2] + style, self._postures[1] + style)
+        left = select(at("look", "approach", "step in"), self._postures[0] + style, left)
+        if present("over"):
+            over = self.palms.measured()[:, 0] + self._over()[0] - self._mass()
+            left = select(at("over"), self.palms.local(over[:, None])[:, 0], left)
+        hand_yaw = yaw
+        if present(*GRASPING):
+            grasping, hand_yaw = self._grasping(), torch.where(at(*GRASPING), self._hand_yaw, yaw)
+            left = select(at(*GRASPING), self.palms.local(grasping[:, None])[:, 0], left)
         left = select(at("open", "rest"), self._last, left)
         self._last = select(mask, left, self._last)
-        both = torch.stack([left, posture[3].expand_as(left)], dim=1)
+        both = torch.stack([left, self._postures[3].expand_as(left)], dim=1)
 
         learn = mask & at("hover", "lower", *CARRYING)
-        wanted = self._root()[:, None] + turn(yaw[:, None], both)
+        wanted = self.sight.root_position[:, None] + turn(yaw[:, None], both)
         command.hand_point = self.palms.lead(wanted, torch.stack([learn, torch.zeros_like(learn)], dim=1), dt)
+        if not raised.any():
+            return
+        hand = quat_multiply(quat_from_yaw(hand_yaw), self._grasp_quat.expand(len(yaw), 4))
         twist = mask & at("hover", "lower")
         angles = self.wrists.lead(
             torch.stack([hand, hand], dim=1), torch.stack([twist, torch.zeros_like(twist)], 1), dt
         )
         columns = WRISTS[0].to(yaw.device)
         command.arms[:, columns] = torch.where(raised[:, None], angles[:, 0], command.arms[:, columns])
+        if present("hover"):
+            miss = torch.linalg.vector_norm(grasping - self.palms.measured()[:, 0], dim=1)
+            cosine = (self.sight.body(self.palms.bodies[0])[1] * hand).sum(dim=1).abs().clamp_max(1.0)
+            self._error = select(mask, torch.stack([miss, 2.0 * torch.acos(cosine)], dim=1), self._error)
 
-        miss = torch.linalg.vector_norm(grasping - palms[:, 0], dim=1)
-        cosine = (self.sight.body(self.palms.bodies[0])[1] * hand).sum(dim=1).abs().clamp_max(1.0)
-        self._error = select(mask, torch.stack([miss, 2.0 * torch.acos(cosine)], dim=1), self._error)
-
-    def _root(self) -> Tensor:
-        return self.sight.root_position
+    def _grasping(self) -> Tensor:
+        """The left palm at the hammer, above it before the grasp and after it [m], [worlds, 3]."""
+        at, clock = self.machine.at, self.machine.clock
+        above = torch.where(at("hover"), HOVER, 0.0) + torch.where(
+            at("lower"), (HOVER - DESCENT * clock).clamp_min(0.0), 0.0
+        )
+        above = above + torch.where(at("lift"), (ASCENT * clock).clamp_max(LIFTED), 0.0)
+        offset = quat_apply(quat_from_yaw(self._hand_yaw), self._palm_offset.expand(len(clock), 3))
+        grasping = self._grasp + offset
+        return torch.cat([grasping[:, :2], (grasping[:, 2] + above)[:, None]], dim=1)

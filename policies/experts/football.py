@@ -124,10 +124,11 @@ class FootballExpert(Expert):
         states.enter("watch", kicked | following & states.late)
         kicking = mask & states.at("kick", "follow")
         # A ball that rolls takes its line with it; once kicked well, the step is ended on the old one.
-        self.lane = select(kicking & (speed < WEAK), self._line(ball), self.lane)
+        if kicking.any():
+            self.lane = select(kicking & (speed < WEAK), self._line(ball), self.lane)
         missed = kicking & (speed < WEAK) & (self._ahead(pose)[:, 0] > PASSED)
         missed = missed | mask & states.at("kick") & states.late
-        over = mask & states.at("watch") & ((speed < SLOW) | self._hopeless(ball, velocity) | states.late)
+        over = states.over("watch", mask, lambda: (speed < SLOW) | self._hopeless(ball, velocity))
         states.enter("approach", missed | over)
         self._choose_foot(missed | over)
         away = torch.linalg.vector_norm(ball - self._aimed, dim=1) > ROLLED
@@ -141,13 +142,14 @@ class FootballExpert(Expert):
         self._before = select(begins, velocity, self._before)
         states.enter("kick", begins)
 
-        off, (steep, least) = self._ahead(pose)[:, 1].abs(), SLOW_DOWN
-        forward = self._speed * (1.0 - steep * off).clamp_min(least)
-        through = along(pose, self.lane[:, :2], self.lane[:, 2], forward)
         drift = rotate_xy(-pose[:, 2], velocity) * ((speed > SLOW) & (speed < CAUGHT))[:, None]
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         command.velocity = select(states.at("approach"), answer.velocity, command.velocity)
-        command.velocity = select(states.at("kick", "follow"), through, command.velocity)
+        if states.present("kick", "follow"):
+            off, (steep, least) = self._ahead(pose)[:, 1].abs(), SLOW_DOWN
+            forward = self._speed * (1.0 - steep * off).clamp_min(least)
+            through = along(pose, self.lane[:, :2], self.lane[:, 2], forward)
+            command.velocity = select(states.at("kick", "follow"), through, command.velocity)
         command.velocity[:, :2] += drift * states.at("approach", "kick")[:, None]
         command.step_time = self._step_time
         command.arms = self._arms
@@ -177,6 +179,8 @@ class FootballExpert(Expert):
 
     def _choose_foot(self, mask: Tensor) -> None:
         """The foot on the ball's side of the picture, so that who sees the picture knows the line."""
+        if not mask.any():
+            return
         pose, ball = self.sight.pose, self.sight.body(self._ball)[0][:, :2]
         left = rotate_xy(-pose[:, 2], ball - pose[:, :2])[:, 1] > 0.0
         self._side = torch.where(mask, torch.where(left, -LANE, LANE), self._side)

@@ -47,7 +47,9 @@ class Palms:
 
     def measured(self) -> Tensor:
         """Left and right palm (`HAND_POINT` ahead of the wrist) in the world [m], shape [worlds, 2, 3]."""
-        return torch.stack([self.sight.point(body, self._ahead) for body in self.bodies], dim=1)
+        return self.sight.once(
+            "palms", lambda: torch.stack([self.sight.point(body, self._ahead) for body in self.bodies], dim=1)
+        )
 
     def local(self, points: Tensor) -> Tensor:
         """World points [m], shape [worlds, n, 3], in the pelvis' heading frame: the frame of `hand_point`."""
@@ -69,9 +71,10 @@ class Palms:
         Returns:
             Points in the pelvis' heading frame [m], shape [worlds, 2, 3].
         """
-        error = self.turned(wanted - self.measured())
-        learned = (self.correction + self.gain * dt * error).clamp(-self.most, self.most)
-        self.correction = torch.where(learn[..., None], learned, self.correction)
+        if learn.any():
+            error = self.turned(wanted - self.measured())
+            learned = (self.correction + self.gain * dt * error).clamp(-self.most, self.most)
+            self.correction = torch.where(learn[..., None], learned, self.correction)
         return self.local(wanted) + self.correction
 
 
@@ -128,7 +131,8 @@ class Wrists:
         """
         forearms = torch.stack([self.sight.body(body)[1] for body in self._forearms], dim=1)
         angles = wrist_angles(forearms, wanted)
-        error = angles - self.sight.joints[:, self._joints]
-        learned = (self.correction + self.gain * dt * error).clamp(-self.most, self.most)
-        self.correction = torch.where(learn[..., None], learned, self.correction)
+        if learn.any():
+            error = angles - self.sight.joints[:, self._joints]
+            learned = (self.correction + self.gain * dt * error).clamp(-self.most, self.most)
+            self.correction = torch.where(learn[..., None], learned, self.correction)
         return angles + self.correction

@@ -150,7 +150,7 @@ class OpenDoorExpert(Expert):
 
     def _yaw(self) -> Tensor:
         """Heading through the doorway [rad], shape [worlds]."""
-        return heading(self.sight.body(self._frame)[1]) + math.pi / 2
+        return self.sight.once("doorway", lambda: heading(self.sight.body(self._frame)[1]) + math.pi / 2)
 
     def _lever(self) -> Tensor:
         """The point of the lever that is pressed, as long as lever and leaf are at rest [m], shape [worlds, 3]."""
@@ -182,15 +182,15 @@ class OpenDoorExpert(Expert):
         deep = (self._lever_angle() < -DEEP) | (self._leaf_angle() > AJAR)
         states.enter("push", pressing & (deep | released & states.late))
 
-        yaw = self._yaw()
-        miss = rotate_xy(-yaw, lever[:, :2] - palm[:, :2])
-        learned = (self._learned + LEARN * miss).clamp(-MOST_LEARNED, MOST_LEARNED)
-        self._learned = select(missed, learned, self._learned)
-        lowered = SINKING * states.clock > ABOVE - TOUCHING
-        states.enter("press", mask & states.at("lower") & (lowered | states.late))
-        inside, open_ = self._inside(), self._leaf_angle() > OPENED
-        passed = mask & states.at("push") & ((inside > FAR_INSIDE) | (inside > INSIDE) & open_)
-        states.enter("through", passed)
+        if missed.any():
+            miss = rotate_xy(-self._yaw(), lever[:, :2] - palm[:, :2])
+            learned = (self._learned + LEARN * miss).clamp(-MOST_LEARNED, MOST_LEARNED)
+            self._learned = select(missed, learned, self._learned)
+        states.enter("press", states.over("lower", mask, lambda: SINKING * states.clock > ABOVE - TOUCHING))
+        if states.present("push"):
+            inside, open_ = self._inside(), self._leaf_angle() > OPENED
+            passed = mask & states.at("push") & ((inside > FAR_INSIDE) | (inside > INSIDE) & open_)
+            states.enter("through", passed)
 
     def _arrive(self, mask: Tensor) -> None:
         """Enter the state that follows a walk."""
@@ -228,6 +228,8 @@ class OpenDoorExpert(Expert):
 
     def _push(self, command: MotionCommand) -> None:
         """Feet behind, straight through the doorway."""
+        if not self.states.present("push"):
+            return
         pushing, yaw = self.states.at("push"), self._yaw()
         right_of_middle = torch.stack([torch.zeros_like(self._lane), -self._lane], dim=1)
         point = self._doorway()[:, :2] + rotate_xy(yaw, right_of_middle)

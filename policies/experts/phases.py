@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -37,6 +37,8 @@ class Phases:
         """Number of each world's phase in the order of `longest`, shape [worlds]."""
         self.clock = torch.zeros(worlds, device=device)
         """Time since the phase was entered [s], shape [worlds]."""
+        self._found: dict[tuple[str, ...], Tensor] = {}
+        self._present: set[str] = set()
 
     def begin(self, mask: Tensor) -> None:
         """The worlds of `mask`, bool, shape [worlds], are in the first phase."""
@@ -52,10 +54,15 @@ class Phases:
         Raises:
             KeyError: There is no such phase.
         """
-        found = self.phase == self._index[names[0]]
-        for name in names[1:]:
-            found = found | (self.phase == self._index[name])
-        return found
+        if names not in self._found:
+            self._found[names] = torch.stack([self.phase == self._index[name] for name in names]).any(dim=0)
+        return self._found[names]
+
+    def present(self, *names: str) -> list[str]:
+        """Those of these phases, or of all without names, that some world is in, in the order given."""
+        if not self._present:
+            self._present = set(self.names())
+        return [name for name in names or self._names if name in self._present]
 
     def enter(self, name: str, mask: Tensor) -> None:
         """The worlds of `mask`, bool, shape [worlds], enter a phase, also when they are in it already.
@@ -63,8 +70,19 @@ class Phases:
         Raises:
             KeyError: There is no such phase.
         """
-        self.phase = self.phase.masked_fill(mask, self._index[name])
-        self.clock = self.clock.masked_fill(mask, 0.0)
+        number = self._index[name]
+        if mask.any():
+            self.phase, self.clock = self.phase.masked_fill(mask, number), self.clock.masked_fill(mask, 0.0)
+            self._found, self._present = {}, set()
+
+    def over(self, name: str, mask: Tensor, condition: Callable[[], Tensor]) -> Tensor:
+        """Worlds of `mask`, bool, shape [worlds], that end this phase: by a condition, or late.
+
+        The condition, bool, shape [worlds], is computed where some world is in the phase.
+        """
+        if not self.present(name):
+            return torch.zeros_like(mask)
+        return mask & self.at(name) & (condition() | self.late)
 
     @property
     def late(self) -> Tensor:

@@ -13,6 +13,7 @@ What each decision is read from:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -256,9 +257,12 @@ class PPBoxExpert(Expert):
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Walk, and lead both hands, as the phase of each world says."""
         self.state.advance(mask, dt)
-        walk = self.walk.command(mask & self.state.at("approach", "step up"), dt)
+        # A world that begins to walk now does so by the command that it would have had.
+        walk = self.walk.command(
+            mask & self.state.at("approach", "step up"), dt, others=bool(self.state.present("retreat"))
+        )
         self._choose_spot(mask & self.state.at("turn", "carry"))
-        haul = self.haul.command(mask & self.state.at("carry"), dt)
+        haul = self.haul.command(mask & self.state.at("carry"), dt, others=bool(self.state.present("turn")))
         self._go_on(mask, walk, haul)
         self._watch(mask)
         self._squeeze(mask, dt)
@@ -285,12 +289,16 @@ class PPBoxExpert(Expert):
 
     def _centre(self) -> Tensor:
         """Centre of the box [m], shape [worlds, 3]."""
-        return self.sight.point(self._body, self._middle)
+        return self.sight.once("centre", lambda: self.sight.point(self._body, self._middle))
 
     def _underside(self) -> Tensor:
         """Height of the box's lowest corner [m], shape [worlds]."""
-        upward = matrix_from_quat(self.sight.body(self._body)[1])[:, 2]
-        return self._centre()[:, 2] - (upward.abs() * self._box_half).sum(dim=1)
+
+        def measure() -> Tensor:
+            upward = matrix_from_quat(self.sight.body(self._body)[1])[:, 2]
+            return self._centre()[:, 2] - (upward.abs() * self._box_half).sum(dim=1)
+
+        return self.sight.once("underside", measure)
 
     def _wide(self) -> Tensor:
         """Half of the box's width from hand to hand as it stands before the robot [m], shape [worlds]."""
@@ -316,6 +324,8 @@ class PPBoxExpert(Expert):
 
     def _approach(self, mask: Tensor) -> None:
         """Go to the place straight in front of the box, from the table's side."""
+        if not mask.any():
+            return
         yaw = heading(self.sight.body(self._body)[1])
         turned = wrap_angle(yaw - 0.5 * math.pi * torch.round(yaw / (0.5 * math.pi)))
         facing, box = turned.clamp(-MOST_TURN, MOST_TURN), self._centre()[:, :2]
@@ -331,6 +341,8 @@ class PPBoxExpert(Expert):
 
     def _choose_spot(self, mask: Tensor) -> None:
         """Go to the place on the deck nearest to the robot."""
+        if not mask.any():
+            return
         here, yaw = self._depth(self.sight.pose[:, :2]), self._deck_yaw()
         x = here[:, 0].clamp(-SIDE, SIDE)
         edge = torch.stack([x, torch.full_like(x, -self._deck_half[1])], dim=1)
@@ -346,39 +358,45 @@ class PPBoxExpert(Expert):
         """
         state, pose = self.state, self.sight.pose
         clock = state.clock
-        deck = self._depth(self._centre()[:, :2])[:, 1]
 
-        def done(phase: str, condition: Tensor) -> Tensor:
-            return mask & state.at(phase) & (condition | state.late)
-
-        def enter(phase: str, following: str, condition: Tensor) -> Tensor:
-            entering = done(phase, condition)
+        def enter(phase: str, following: str, condition: Callable[[], Tensor]) -> Tensor:
+            entering = state.over(phase, mask, condition)
             state.enter(following, entering)
             return entering
 
-        away = torch.linalg.vector_norm(pose[:, :2] - self._stand[:, :2], dim=1)
-        off = torch.linalg.vector_norm(pose[:, :2] - self._spot[:, :2], dim=1)
-        self._approach(done("retreat", away > BACK))
-        enter("leave", "stand", off > BACK)
-        enter("open", "leave", (self.half >= self._opened()) & (clock > LET_GO))
-        sunk = self.underside < self._deck_top() - SUNK + self._down
-        enter("lower", "open", sunk & (self._underside() < self._deck_top() + RESTS))
-        enter("reach", "lower", deck >= self._inside - ENOUGH)
-        close = self._depth(pose[:, :2])[:, 1] > -STRETCHING[1] - ENOUGH
-        enter("carry", "reach", passing(haul, STOP) & close)
-        enter("turn", "carry", wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING)
-        enter("back", "turn", away > BACK)
-        lifted = done("lift", self._underside() > self._table + LIFTED)
+        def away(start: Tensor) -> Tensor:
+            return torch.linalg.vector_norm(pose[:, :2] - start[:, :2], dim=1) > BACK
+
+        def sunk() -> Tensor:
+            low = self.underside < self._deck_top() - SUNK + self._down
+            return low & (self._underside() < self._deck_top() + RESTS)
+
+        def there() -> Tensor:
+            return passing(haul, STOP) & (self._depth(pose[:, :2])[:, 1] > -STRETCHING[1] - ENOUGH)
+
+        self._approach(state.over("retreat", mask, lambda: away(self._stand)))
+        enter("leave", "stand", lambda: away(self._spot))
+        enter("open", "leave", lambda: (self.half >= self._opened()) & (clock > LET_GO))
+        enter("lower", "open", sunk)
+        enter("reach", "lower", lambda: self._depth(self._centre()[:, :2])[:, 1] >= self._inside - ENOUGH)
+        enter("carry", "reach", there)
+        enter("turn", "carry", lambda: wrap_angle(0.5 * math.pi - pose[:, 2]) < FACING)
+        enter("back", "turn", lambda: away(self._stand))
+        lifted = state.over("lift", mask, lambda: self._underside() > self._table + LIFTED)
         held = self._underside() > self._table + SLIPPED
         state.enter("back", lifted & held)
         state.enter("retreat", lifted & ~held)
-        enter("close", "lift", (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
-        enter("align", "close", (clock > SOONEST) & (self._missing() < ALIGNED))
-        enter("step up", "align", passing(walk, PASSING))
-        self.walk.to(enter("approach", "step up", passing(walk, PASSING) & (state.clock > 0)), beyond(self._stand))
+        enter("close", "lift", lambda: (self._overlap() > self._deep - SHORT) & (clock > SQUEEZED))
+        enter("align", "close", lambda: (clock > SOONEST) & (self._missing() < ALIGNED))
+        enter("step up", "align", lambda: passing(walk, PASSING))
+        stepping = enter("approach", "step up", lambda: passing(walk, PASSING) & (state.clock > 0))
+        if stepping.any():
+            self.walk.to(stepping, beyond(self._stand))
 
     def _watch(self, mask: Tensor) -> None:
         """Leave the usual order where the box rests somewhere else than between the hands."""
+        if not self.state.present(*HELD):
+            return
         box, palms = self._centre(), self.palms.measured().mean(dim=1)
         out = torch.linalg.vector_norm(box - palms, dim=1) > DROPPED
         rests = torch.linalg.vector_norm(self._box_velocity(), dim=1) < RESTING
@@ -423,6 +441,24 @@ class PPBoxExpert(Expert):
     def _squeeze(self, mask: Tensor, dt: float) -> None:
         """Palms beside the box, fists level; then together until they are commanded `OVERLAP` deeper than they get."""
         state = self.state
+        self._align(mask, dt)
+        if state.present("close", "lift"):
+            closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, 2.0 * CLOSING)
+            squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
+            self.half = select(mask & state.at("close", "lift"), squeezed, self.half)
+        holding = self._box_half[:2].amin() + FIST - HOLDING
+        step = dt * RELAXING
+        held = self.half + (holding - self.half).clamp(-step, step)
+        self.half = select(mask & state.at("back", "turn", "carry", "reach", "lower"), held, self.half)
+        if state.present("open", "retreat"):
+            opening = torch.minimum(self.half + OPENING * dt, self._opened())
+            self.half = select(mask & state.at("open", "retreat"), opening, self.half)
+
+    def _align(self, mask: Tensor, dt: float) -> None:
+        """Palms beside the box, fists level."""
+        state = self.state
+        if not state.present("approach", "step up", "align"):
+            return
         before, aligning = state.at("approach", "step up"), state.at("align")
         middle = self._grasp()
         ready = torch.cat([self._ready, middle[:, 2:]], dim=1)
@@ -439,18 +475,10 @@ class PPBoxExpert(Expert):
         angles = self.wrists.lead(level, learn, dt)
         self._angles = select(mask & (before | aligning), angles, self._angles)
 
-        closing = dt * (SERVO * (self._deep - self._overlap())).clamp(-CLOSING, 2.0 * CLOSING)
-        squeezed = torch.maximum(self.half - closing, self._box_half[:2].amin() + FIST - DEEPEST)
-        self.half = select(mask & state.at("close", "lift"), squeezed, self.half)
-        holding = self._box_half[:2].amin() + FIST - HOLDING
-        step = dt * RELAXING
-        held = self.half + (holding - self.half).clamp(-step, step)
-        self.half = select(mask & state.at("back", "turn", "carry", "reach", "lower"), held, self.half)
-        opening = torch.minimum(self.half + OPENING * dt, self._opened())
-        self.half = select(mask & state.at("open", "retreat"), opening, self.half)
-
     def _carry(self, mask: Tensor, dt: float) -> None:
         """Height of the box and distance of the fists from the body."""
+        if not self.state.present(*HELD):
+            return
         state, deck = self.state, self._deck_top()
         over = state.at("turn", "carry", "reach")
         target = torch.where(state.at("lift", "back"), self._table + LIFT, torch.where(over, deck + CLEAR, deck - SUNK))
@@ -475,15 +503,14 @@ class PPBoxExpert(Expert):
 
     def _velocity(self, walk: Tensor, haul: Tensor) -> Tensor:
         """Velocity of each world for its phase, shape [worlds, 3]."""
-        state, pose = self.state, self.sight.pose
-        slow = torch.full_like(self._pace, -LEAVE)
-        backward = along(pose, self._stand[:, :2], self._stand[:, 2], slow)
-        leave = along(pose, self._spot[:, :2], self._spot[:, 2], slow)
+        state = self.state
         velocity = torch.zeros_like(walk)
         velocity = select(state.at("approach", "step up"), paced(walk, self._pace), velocity)
         velocity = select(state.at("carry"), paced(haul, self._pace), velocity)
-        velocity = select(state.at("back", "retreat"), backward, velocity)
-        velocity = select(state.at("leave"), leave, velocity)
+        for line, phases in ((self._stand, ("back", "retreat")), (self._spot, ("leave",))):
+            if state.present(*phases):
+                backward = along(self.sight.pose, line[:, :2], line[:, 2], torch.full_like(self._pace, -LEAVE))
+                velocity = select(state.at(*phases), backward, velocity)
         return select(state.at("turn"), self._turning, velocity)
 
 

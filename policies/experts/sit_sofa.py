@@ -90,6 +90,8 @@ LONGEST = {
 }
 """Phase → longest time [s]. `stand` to `straighten` take just this time. Success ends the episode: `sit` ends only
 where the seat was missed. A walk that is late is planned again."""
+SITTING = ("stand", "lower", "press", "sit", "rise")
+"""Phases in which the robot moves on the spot."""
 NEXT = dict(zip(LONGEST, [*list(LONGEST)[1:], "back"], strict=True))
 """Phase → the one after it; the last one leads back to the edge."""
 
@@ -187,11 +189,12 @@ class SitSofaExpert(Expert):
     def command(self, mask: Tensor, dt: float) -> MotionCommand:
         """Command the phase, then see whether it ends."""
         walking = mask & self.phase.at("approach")
-        cartons = self._rectangles(self._cartons)
-        moved = (cartons - self._seen)[..., :2].abs().amax(dim=(1, 2)) > MOVED
-        again = walking & (moved | (self.phase.clock == 0.0))
-        if again.any():
-            self._plan(again, cartons)
+        if walking.any():
+            cartons = self._rectangles(self._cartons)
+            moved = (cartons - self._seen)[..., :2].abs().amax(dim=(1, 2)) > MOVED
+            again = walking & (moved | (self.phase.clock == 0.0))
+            if again.any():
+                self._plan(again, cartons)
         walk = self.walk.command(walking, dt)
         self.phase.advance(mask, dt)
         self._named = self.phase.names()
@@ -201,13 +204,12 @@ class SitSofaExpert(Expert):
         late = self.phase.late
         lost = mask & late & (self.phase.at("approach") | (self.phase.at("sideways") & (offset[:, 0] > IN_FRONT)))
         early = {
-            "approach": (walk.distance < GATE_WITHIN[0]) & (walk.heading_error.abs() < GATE_WITHIN[1]),
-            "sideways": (offset[:, 0] - self._seat_aside).abs() < ASIDE_WITHIN,
-            "back": offset[:, 1] < SEAT_AHEAD - self._nearer + BACKED,
-            "forward": offset[:, 1] > self._gap_ahead,
+            "approach": lambda: (walk.distance < GATE_WITHIN[0]) & (walk.heading_error.abs() < GATE_WITHIN[1]),
+            "sideways": lambda: (offset[:, 0] - self._seat_aside).abs() < ASIDE_WITHIN,
+            "back": lambda: offset[:, 1] < SEAT_AHEAD - self._nearer + BACKED,
+            "forward": lambda: offset[:, 1] > self._gap_ahead,
         }
-        done = {name: late | early[name] if name in early else late for name in NEXT}
-        leaving = {name: mask & ~lost & self.phase.at(name) & ended for name, ended in done.items()}
+        leaving = {name: self.phase.over(name, mask & ~lost, early.get(name, lambda: late)) for name in NEXT}
         self._nearer = self._nearer + NEARER * leaving["sit"]
         for name, following in NEXT.items():
             self.phase.enter(following, leaving[name])
@@ -223,8 +225,11 @@ class SitSofaExpert(Expert):
         at = self.phase.at
         command = MotionCommand.neutral(self.sight.worlds, self.sight.device)
         walking = approach * (self._pace * at("approach"))[:, None]
-        command.velocity = torch.where(at("sideways", "back", "forward")[:, None], self._drift(offset), walking)
-
+        command.velocity = walking
+        if self.phase.present("sideways", "back", "forward"):
+            command.velocity = torch.where(at("sideways", "back", "forward")[:, None], self._drift(offset), walking)
+        if not self.phase.present(*SITTING):
+            return command
         lowering, pressing, rising = at("lower"), at("press", "sit"), at("rise")
         fraction = torch.where(at("sit"), 1.0, self.phase.fraction)
 

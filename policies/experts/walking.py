@@ -33,6 +33,8 @@ class Walk:
         self.goal = torch.zeros(sight.worlds, 3, device=sight.device)
         """x, y [m], yaw [rad] to stand at, shape [worlds, 3]."""
         self._route = torch.zeros(0, device=sight.device)
+        none = torch.zeros(sight.worlds, device=sight.device)
+        self._idle = NavigationCommand(torch.zeros_like(self.goal), none > 0, none, none, none)
 
     def begin(self, mask: Tensor) -> None:
         """Episodes begin in the worlds of `mask`, bool, shape [worlds]."""
@@ -46,6 +48,8 @@ class Walk:
             goal: x, y [m], yaw [rad], shape [worlds, 3].
             floor: Obstacles to walk around, by a path planned from where the robot is; without it the way is straight.
         """
+        if not mask.any():
+            return
         here = self.sight.pose[:, :2]
         self.goal = select(mask, goal, self.goal)
         points = here[:, None] if floor is None else plan(here, goal[:, :2], floor).points
@@ -54,8 +58,13 @@ class Walk:
         self._route = select(mask, _padded(points, longest), _padded(old, longest))
         self.navigator.retarget(mask)
 
-    def command(self, mask: Tensor, dt: float) -> NavigationCommand:
-        """One step of the loop for the worlds of `mask`, bool, shape [worlds], dt [s] after the last one."""
+    def command(self, mask: Tensor, dt: float, *, others: bool = False) -> NavigationCommand:
+        """One step of the loop for the worlds of `mask`, bool, shape [worlds], dt [s] after the last one.
+
+        The command of another world has a meaning only where `others` is set: the one to its present goal.
+        """
+        if not (others or mask.any()):
+            return self._idle
         return self.navigator.command(self.sight.pose, self.goal, dt, route=self._route, mask=mask)
 
 

@@ -27,7 +27,7 @@ def test_modules_are_tried_in_another_process(tmp_path, monkeypatch):
     (tmp_path / "never_ends.py").write_text("import time\ntime.sleep(100)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     names = ["json", "no_such_module", "dies_at_once", "never_ends"]
-    answers = sandboxed_load.faults("module", names, memory=1 << 30, seconds=2.0)
+    answers = sandboxed_load.faults("module", names, memory=1 << 30, seconds=1.0)
     assert answers == [None, "No module named 'no_such_module'", sandboxed_load.CRASHED, sandboxed_load.TOO_LONG]
 
 

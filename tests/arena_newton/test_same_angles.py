@@ -10,8 +10,8 @@ import arena_newton
 from arena_newton.robot import rotations
 from arena_newton.robot.rotations import atan2, heading, wrap_angle
 
-ROWS = (1, 5, 20, 31, 32, 33, 60, 128)
-"""torch computes blocks of 32 angles otherwise than what is left over."""
+ROWS = (1, 7, 8, 20, 31, 32, 33, 60, 128)
+"""torch computes blocks of 8 to 32 angles otherwise than what is left over."""
 PACKAGE = Path(arena_newton.__file__).parent
 
 

@@ -1,6 +1,5 @@
 """Lets the tests of this folder import each other's stand-ins, and makes what several files read."""
 
-import os
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -10,25 +9,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def installed():
-    """Versions of the installed packages are read once, not by every command."""
-    from arena_newton import doctor
-
-    found = doctor.versions()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor, "versions", lambda: dict(found))
-        yield
-
-
 @pytest.fixture(scope="session")
 def made_suite(tmp_path_factory):
     """A suite of known outcomes."""
     from made_suites import plan, write_suite
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: None)  # thousands of journal lines
-        return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
+    return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
 
 
 class Keepers(defaultdict):
@@ -47,14 +33,21 @@ class Keepers(defaultdict):
             keeper.drop()
 
 
+def keepers(kind):
+    """Builder of environments of a kind, which all files share, and then its end."""
+    from arena_newton.eval.play.env_cache import EnvCache
+
+    made = Keepers(lambda: EnvCache(kind))
+    yield made
+    made.drop()
+
+
 @pytest.fixture(scope="session")
 def kept_worlds():
     """Environments that all files share."""
-    from arena_newton.eval.play.env_cache import EnvCache
+    from arena_newton.eval.play.env_cache import CachedEnv
 
-    keepers = Keepers(EnvCache)
-    yield keepers
-    keepers.drop()
+    yield from keepers(CachedEnv)
 
 
 @pytest.fixture(scope="session")
@@ -62,14 +55,15 @@ def watched_worlds():
     """Environments that all files share and that keep a hash of every tick."""
     from watched import LastingWatchedEnv
 
-    from arena_newton.eval.play import env_cache
+    yield from keepers(LastingWatchedEnv)
 
-    def keeper():
-        return env_cache.EnvCache(LastingWatchedEnv)
 
-    keepers = Keepers(keeper)
-    yield keepers
-    keepers.drop()
+@pytest.fixture(scope="session")
+def quick_worlds():
+    """Environments that all files share and whose episodes soon succeed."""
+    from quick_worlds import QuickEnv
+
+    yield from keepers(QuickEnv)
 
 
 @pytest.fixture(scope="session")

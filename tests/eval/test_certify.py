@@ -70,14 +70,15 @@ CHECKS = (*solvable.CHECKS, *legs.CHECKS, *swap.CHECKS)
 
 
 @pytest.fixture(autouse=True)
-def without_pictures(monkeypatch):
-    """These worlds have nothing to draw."""
+def small(monkeypatch):
+    """These worlds have nothing to draw, and eight episodes of a swap are enough."""
     monkeypatch.setattr(runs, "_recorder", lambda *_: None)
+    monkeypatch.setattr(swap, "ENOUGH", 8)
 
 
 def options(folder, **changes):
     """Flags of a small certification."""
-    given = {"out": str(folder), "task": ("boxing", "vis_navi"), "quick": True, "episodes": 30}
+    given = {"out": str(folder), "task": ("boxing", "vis_navi"), "quick": True, "episodes": 4}
     return CertifyOptions(**(given | changes))
 
 
@@ -92,19 +93,19 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     for name in ("solvable", "frozen-legs", "gliding-base", "swap"):
         assert any(re.match(rf"pass  {name} ", line) for line in lines), name
-    assert lines[0].startswith("--quick: 30 episodes") and "intervals are wide" in lines[0]
+    assert lines[0].startswith("--quick: 4 episodes") and "intervals are wide" in lines[0]
     assert "Certified: 3 claims hold." in lines and any(
         line.startswith("pass  Experts need their legs") for line in lines
     )
     checks = read(tmp_path / "o")
     assert [row[:4] for row in checks["solvable"]["tables"][0]["rows"]] == [
-        [task, tracker, rules, "30/30"]
-        for tracker, rules in (("twist2", "paper"), ("twist2", "released"), ("sonic", "paper"))
+        [task, tracker, rules, "4/4"]
+        for tracker, rules in (("twist2", "paper"), ("sonic", "paper"))
         for task in ("boxing", "vis_navi")
     ]
     swapped = {tuple(row[:3]): row[3:] for row in checks["swap"]["tables"][0]["rows"]}
-    assert swapped["all", "twist2", "sonic"] == ["60/60", "0/60", "0 % to 6 %", "", "-100", "0 %"]
-    assert f"twist2 to sonic keeps 0 % (p = {mcnemar(60, 0):.2g})" in checks["swap"]["summary"]
+    assert swapped["all", "twist2", "sonic"] == ["8/8", "0/8", "0 % to 32 %", "", "-100", "0 %"]
+    assert f"twist2 to sonic keeps 0 % (p = {mcnemar(8, 0):.2g})" in checks["swap"]["summary"]
     for name in ("certify.html", "certify.md"):
         assert "gliding-base" in (tmp_path / "o" / name).read_text()
 
@@ -112,7 +113,7 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("envs", "name", "verdict", "said"),
     [
-        ({"frozen": SolvedEnv, "gliding": StuckEnv}, "frozen-legs", "fail", "boxing: 30 successes with frozen legs"),
+        ({"frozen": SolvedEnv, "gliding": StuckEnv}, "frozen-legs", "fail", "boxing: 4 successes with frozen legs"),
         ({"frozen": StuckEnv, "gliding": SolvedEnv}, "gliding-base", "note", "the arms alone reach down to it"),
     ],
 )
@@ -136,7 +137,7 @@ def test_a_gliding_base_without_a_known_reason_fails(tmp_path, monkeypatch):
 
 def test_unsolved_tasks_fail(tmp_path, capsys):
     """An expert that is significantly below nine of ten fails the benchmark, and the line names it."""
-    given = options(tmp_path, checks=("solvable",), task=("boxing",), tracker=("twist2",))
+    given = options(tmp_path, checks=("solvable",), task=("boxing",), tracker=("twist2",), episodes=12)
     assert certify.run(given, factories(), checks=CHECKS) == 1
     assert "1 of 1 checks failed: solvable" in capsys.readouterr().out
     assert "below that are boxing through twist2" in read(tmp_path)["solvable"]["notes"][0]
@@ -153,7 +154,7 @@ def test_a_swap_that_costs_nothing_is_told_apart_from_one_with_few_episodes(tmp_
 
 def test_the_control_of_the_swap(tmp_path):
     """Each recording is replayed through its own tracker too, under --quick some; one that ends otherwise fails."""
-    given = {"quick": False, "task": ("boxing",), "checks": ("swap",), "episodes": 20}
+    given = {"quick": False, "task": ("boxing",), "checks": ("swap",), "episodes": 4}
 
     class Forgetful(SwappedPolicy):
         def attach(self, env):
@@ -161,8 +162,8 @@ def test_the_control_of_the_swap(tmp_path):
 
     assert certify.run(options(tmp_path / "a", **given), factories(**PARTS), checks=CHECKS) == 0
     rows = {tuple(row[:3]): row[3:5] for row in read(tmp_path / "a")["swap"]["tables"][0]["rows"]}
-    assert rows["boxing", "twist2", "twist2"] == rows["boxing", "sonic", "sonic"] == ["20/20", "20/20"]
-    assert rows["boxing", "twist2", "sonic"] == ["20/20", "0/20"]
+    assert rows["boxing", "twist2", "twist2"] == rows["boxing", "sonic", "sonic"] == ["4/4", "4/4"]
+    assert rows["boxing", "twist2", "sonic"] == ["4/4", "0/4"]
     parts = PARTS | {"policy": Forgetful}
     assert certify.run(options(tmp_path / "b", **given), factories(**parts), checks=CHECKS) == 1
     said = "ends otherwise: boxing through twist2 under paper, seed 0 repeat 0: outcome success, in the replay timeout"
@@ -183,8 +184,8 @@ def test_it_goes_on_where_it_was(tmp_path, capsys):
         certify.run(given, factories(**PARTS), checks=CHECKS)
     assert certify.run(options(tmp_path, checks=("solvable",), resume=True), factories(**PARTS), checks=CHECKS) == 0
     assert SolvedEnv.built == built and (tmp_path / "certify.json").read_text() == before
-    with pytest.raises(InputError, match="another configuration: repeats was 30, now 29"):
-        certify.run(options(tmp_path, episodes=29, resume=True), factories(**PARTS), checks=CHECKS)
+    with pytest.raises(InputError, match="another configuration: repeats was 4, now 3"):
+        certify.run(options(tmp_path, episodes=3, resume=True), factories(**PARTS), checks=CHECKS)
 
 
 @pytest.mark.parametrize(

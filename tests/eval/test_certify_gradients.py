@@ -104,6 +104,7 @@ def test_the_gradients_of_a_task(tmp_path, monkeypatch):
 
 def test_a_flight_that_is_off_is_found(monkeypatch):
     """The flight's own slopes agree; those of a flight whose gradient to the velocity is a percent off do not."""
+    monkeypatch.setattr(gradients, "FLIGHT", 5)
     ball, cpu = RollingBall(radius=0.11, mass=0.43, friction=0.7, restitution=0.1), torch.device("cpu")
     assert agreement_of(flight_slopes(ball, cpu)).holds
     honest = gradients.ball_flight

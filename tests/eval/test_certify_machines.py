@@ -65,7 +65,7 @@ def test_shards_of_a_plan_are_one_run(tmp_path):
     """All files of three merged shards are those of one process; a second time nothing is played."""
     code, found = certified(tmp_path, "shards")
     assert code == 0 and found["verdict"] == "pass"
-    assert found["summary"] == "39 of 39 files of 3 merged shards (12 episodes) are those of one process, byte for byte"
+    assert found["summary"] == "23 of 23 files of 3 merged shards (6 episodes) are those of one process, byte for byte"
     rows = {row[0]: row[1:] for row in found["tables"][0]["rows"]}
     assert {"config.json", "episodes.jsonl", "results.json", "table.md", "report.html"} <= set(rows)
     assert all(one == other for one, other in rows.values()) and len(set(map(tuple, rows.values()))) == len(rows)
@@ -90,7 +90,7 @@ def test_a_merge_that_loses_a_line_fails(tmp_path, monkeypatch, name):
 
     monkeypatch.setattr(machines.shard_merge, "merge", lossy)
     code, found = certified(tmp_path, "shards")
-    assert code == 1 and found["notes"] == [f"{name} differs"] and found["summary"].startswith("38 of 39 files")
+    assert code == 1 and found["notes"] == [f"{name} differs"] and found["summary"].startswith("22 of 23 files")
 
 
 def test_shards_that_are_not_merged_fail(tmp_path, monkeypatch):
@@ -140,8 +140,8 @@ def test_a_file_that_an_actor_did_not_write_fails(tmp_path, by_copy):
     [
         ({"code": 2, "said": "error: no Ray cluster"}, "fail", "ended with code 2: error: no Ray cluster"),
         ({"code": None}, "fail", "took longer than 60 min"),
-        ({"killed_after": None, "lost": 0}, "note", "files of 2 Ray actors (12 episodes) are those"),
-        ({"lost": 0}, "note", "files of 2 Ray actors (12 episodes) are those"),
+        ({"killed_after": None, "lost": 0}, "note", "files of 2 Ray actors (6 episodes) are those"),
+        ({"lost": 0}, "note", "files of 2 Ray actors (6 episodes) are those"),
     ],
 )
 def test_a_run_that_shows_nothing_does_not_pass(tmp_path, by_copy, facts, verdict, said):

@@ -75,15 +75,15 @@ def test_configuration_is_two_lines(tmp_path, capsys):
     assert "  football twist2 base: engine mujoco, device cpu, physics_dt 0.001, startup_ticks 0" in captured.err
 
 
-def test_a_log_file_gets_lines(tmp_path):
+def test_a_log_file_gets_lines(tmp_path, monkeypatch, capsys):
     """Where no terminal is, nothing is drawn over: no carriage return, and few lines."""
-    script = Path(__file__).parent / "eval_fakes.py"
-    command = [sys.executable, str(script), "--task", "football", "boxing", "--engine", "mujoco", "--out", "o"]
-    environment = os.environ | {"FAKE_TICK_S": "0.002"}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, env=environment, check=True)
-    assert b"\r" not in done.stderr and b"\r" not in done.stdout
-    assert 1 <= done.stderr.count(b"\n") < 10
-    assert b"boxing twist2 base: 120 of 120 episodes, 100% of the tick budget" in done.stderr
+    monkeypatch.setenv("FAKE_TICK_S", "0.002")
+    flags = ["--task", "football", "boxing", "--engine", "mujoco", "--out", str(tmp_path / "o")]
+    assert main(flags, factories()) == 0
+    said = capsys.readouterr()
+    assert "\r" not in said.err + said.out
+    assert 1 <= said.err.count("\n") < 10
+    assert "boxing twist2 base: 120 of 120 episodes, 100% of the tick budget" in said.err
 
 
 def test_protocol_is_the_default_of_a_named_task(tmp_path):
@@ -314,36 +314,25 @@ def test_options_are_written_as_they_are_typed():
     assert words(RunOptions()) == []
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "run --task football nosuch",
-        "run --drive stiff",
-        "run --worlds 0",
-        "run --policy nosuch",
-        "run --checkpoint absent.onnx",
-        "run --rules mine",
-        "run --mode bases",
-        "run --strip --video-size 9x9",
-        "run --engine bullet",
-        "run --engine mujoco --out /dev/null",
-        "list --device tpu",
-        "list --task football --engine mujoco",
-    ],
-)
-def test_planning_imports_nothing_heavy(command):
+def test_planning_imports_nothing_heavy():
     """A plan, and what is wrong with one, need no library of physics, networks or pictures."""
+    flags = ["--task football nosuch", "--drive stiff", "--worlds 0", "--policy nosuch", "--checkpoint absent.onnx"]
+    flags += ["--rules mine", "--mode bases", "--strip --video-size 9x9", "--engine bullet", "--device tpu"]
+    flags += ["--engine mujoco --out /dev/null"]
     code = (
         "import sys; from arena_newton.eval.__main__ import main\n"
-        "code = main(sys.argv[1:])\n"
-        "heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'cv2', 'av'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-        "sys.exit(code)"
+        "for words in sys.argv[1:]:\n"
+        "    code = main(words.split())\n"
+        "    heavy = {'warp', 'torch', 'pxr', 'mujoco', 'newton', 'lerobot', 'cv2', 'av'} & set(sys.modules)\n"
+        "    assert not heavy, (words, heavy)\n"
+        "    assert code == (2 if words.startswith('run') else 0), words"
     )
-    done = subprocess.run([sys.executable, "-c", code, *command.split()], capture_output=True, text=True)
-    right = command == "list --task football --engine mujoco"
-    assert done.returncode == (0 if right else 2), done.stderr
-    assert right or done.stderr.startswith(f"error: --{command.split(' --')[-1].split(' ')[0]}")
+    commands = [*(f"run {words}" for words in flags), "list --task football --engine mujoco"]
+    done = subprocess.run([sys.executable, "-c", code, *commands], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    answers = [f"error: --{words.split('--')[-1].split()[0]}" for words in flags]
+    assert all(map(str.startswith, done.stderr.splitlines(), answers)), done.stderr
+    assert done.stderr.count("\n") == len(answers)
 
 
 def test_doctor_names_what_is_missing(monkeypatch, capsys):

@@ -1,9 +1,11 @@
 """One checkpoint through its doors: what is compared and refused, and that a stock lerobot-eval plays ours."""
 
+import contextlib
 import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -98,7 +100,22 @@ def test_a_folder_that_holds_something_is_left_alone(checkpoint, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_a_door_that_fails_says_what_its_program_said(checkpoint, tmp_path):
+@pytest.fixture
+def here(monkeypatch):
+    """The programs of doors run in this process, by their command lines; gives their exit codes."""
+    codes = []
+
+    def call(command, *, stdout, **_):
+        assert command[:3] == [sys.executable, "-m", "arena_newton.eval"]
+        with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
+            codes.append(main(command[3:]))
+        return SimpleNamespace(returncode=codes[-1])
+
+    monkeypatch.setattr(door_comparison.subprocess, "run", call)
+    return codes
+
+
+def test_a_door_that_fails_says_what_its_program_said(checkpoint, tmp_path, here):
     """The last line of the program that failed, and where the rest is; a policy that does not know the task."""
     options = DoorOptions(
         checkpoint=str(checkpoint), out=str(tmp_path / "out"), doors=("lerobot",), task="football", max_steps=2
@@ -107,6 +124,25 @@ def test_a_door_that_fails_says_what_its_program_said(checkpoint, tmp_path):
         InputError, match="door lerobot: exit code 2, .*was trained on boxing, vis_navi, not on football"
     ):
         door_comparison.run(options)
+    assert here == [2]
+
+
+def test_our_runner_as_a_door(checkpoint, tmp_path, here):
+    """One door alone: what its program did is read from its files."""
+    flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]
+    assert main(["doors", *flags, "--doors", "lerobot", "--out", str(tmp_path / "out")]) == 0
+    (row,) = json.loads((tmp_path / "out" / "doors.json").read_text())["doors"]
+    assert row["steps"] == [TICKS] and row["episodes"] == len(here) == 1 and row["promised"]
+
+
+def test_a_door_is_a_program(tmp_path):
+    """It runs with one thread, what it prints goes into a file, and its exit code counts."""
+    program = "import os, sys; print('said', os.environ['MKL_NUM_THREADS'], flush=True); sys.exit('lost')"
+    log = tmp_path / "log"
+    door_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0, 1))
+    assert log.read_text() == "said 1\nlost\n"
+    with pytest.raises(InputError, match=f"door openpi: exit code 1, lost; all of it is in {log}"):
+        door_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0,))
 
 
 def argv(monkeypatch, checkpoint, *flags):
@@ -221,12 +257,3 @@ def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     assert all(row["same_everything"] and row["steps"] == [TICKS, TICKS] for row in written["doors"])
     text = (tmp_path / "out" / "doors.md").read_text()
     assert "lerobot.scripts.lerobot_eval" in text and text.count("policies.serve") == 4
-
-
-@pytest.mark.release
-def test_our_runner_as_a_door(checkpoint, tmp_path):
-    """One door alone: its program runs, and what it did is read from its files."""
-    flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]
-    assert main(["doors", *flags, "--doors", "lerobot", "--out", str(tmp_path / "out")]) == 0
-    (row,) = json.loads((tmp_path / "out" / "doors.json").read_text())["doors"]
-    assert row["steps"] == [TICKS] and row["episodes"] == 1 and row["promised"]

@@ -75,15 +75,25 @@ def test_episodes_do_not_know_what_ran_before(played, tmp_path):
     assert first != ends(out / "still/twist2/boxing/base/episodes.jsonl")
 
 
+class Stub:
+    """An environment that holds nothing."""
+
+    def __init__(self, task, **options):
+        """Take what the cache passes on."""
+
+    def end(self):
+        """Nothing to release."""
+
+
 def test_another_environment_is_built():
     """Another number of worlds, another mode or what was dropped is built again; the same is handed out again."""
-    cache = EnvCache()
-    made = {"engine": "mujoco", "device": "cpu", "rules": "paper", "mode": "base"}
-    first = cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made)
-    first.close()
-    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=1, **made) is first
-    second = cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made)
-    assert second is not first and cache.built == 2
+    cache, pd = EnvCache(Stub), trackers.get("pd")
+    first = cache("boxing", tracker=pd, worlds=1, mode="base")
+    assert cache("boxing", tracker=trackers.get("pd"), worlds=1, mode="base") is first and cache.built == 1
+    for worlds, mode in ((2, "base"), (1, "visual"), (1, "base")):
+        last = first
+        first = cache("boxing", tracker=pd, worlds=worlds, mode=mode)
+        assert first is not last
+    assert cache.built == 4
     cache.drop()
-    assert cache("boxing", tracker=trackers.get("twist2", None), worlds=2, **made) is not second
-    cache.drop()
+    assert cache("boxing", tracker=pd, worlds=1, mode="base") is not first

@@ -11,13 +11,10 @@ from pathlib import Path
 import pytest
 from eval_fakes import factories
 
-from arena_newton import doctor
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.plan import config
 from arena_newton.eval.records import identity
 
-COUNT = 160
-"""Mutated files a reader."""
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "2"]
 VALUES = (
     *("null", "true", "-1", "0", "1", "3", "1e308", "1e999", "-1e999", "NaN", "Infinity", "1" + "0" * 30, "9" * 5000),
@@ -84,24 +81,28 @@ def spoiled(data, rng):
     return bytes(data)
 
 
-@pytest.fixture
-def base(tmp_path, monkeypatch):
-    """A small results folder two floors down, and files beside it that must not change."""
-    installed = doctor.versions()
-    monkeypatch.setattr(doctor, "versions", lambda: installed)
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A small results folder; what each command looks up again is looked up once."""
     cached = functools.cache(identity.hash_path)
-    monkeypatch.setattr(config, "code_hash", lambda: "0" * 12)
-    for module in (config, identity):
-        monkeypatch.setattr(module, "hash_path", cached)
-    monkeypatch.setattr("os.fsync", lambda file: None)
+    folder = tmp_path_factory.mktemp("sound") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "code_hash", lambda: "0" * 12)
+        for module in (config, identity):
+            patch.setattr(module, "hash_path", cached)
+        assert main([*FLAGS, "--out", str(folder)], factories()) == 0
+        for path in folder.iterdir():
+            if path.name not in ("config.json", "episodes.jsonl"):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        yield folder
+
+
+@pytest.fixture
+def base(sound, tmp_path, monkeypatch):
+    """A copy of it two floors down, and files beside it that must not change."""
     monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "outer" / "inner" / "run"
-    folder.parent.mkdir(parents=True)
+    folder = shutil.copytree(sound, tmp_path / "outer" / "inner" / "run")
     (tmp_path / "outer" / "victim").write_text("mine")
-    assert main([*FLAGS, "--out", str(folder)], factories()) == 0
-    for path in folder.iterdir():
-        if path.name not in ("config.json", "episodes.jsonl"):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
     return folder
 
 
@@ -141,37 +142,35 @@ def check(folder, mutants, write, capsys, commands):
     print(f"{len(mutants)} mutants: {counts}")
 
 
-def test_mutated_journals(base, capsys):
+def test_mutated_journals(base, mutants, capsys):
     """A journal changed anywhere gives a report or one line with code 2, and nothing is written elsewhere."""
     rng = random.Random(1)
     path = base / "episodes.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
-    mutants = []
-    for number in range(COUNT):
+    made = []
+    for number in range(mutants):
         at = rng.randrange(len(lines))
         if number % 5 == 4:
-            mutants.append(spoiled(b"".join(lines), rng))
+            made.append(spoiled(b"".join(lines), rng))
         else:
             line = mutated(json.loads(lines[at]), rng)
-            mutants.append(b"".join([*lines[:at], line + b"\n", *lines[at + 1 :]]))
-    check(base, mutants, path.write_bytes, capsys, (["report"], ["report"], ["resume"]))
+            made.append(b"".join([*lines[:at], line + b"\n", *lines[at + 1 :]]))
+    check(base, made, path.write_bytes, capsys, (["report"], ["report"], ["resume"]))
 
 
-def test_mutated_configurations(base, capsys):
+def test_mutated_configurations(base, mutants, capsys):
     """A config.json changed anywhere gives a report, a continued run or one line with code 2."""
     rng = random.Random(2)
     path = base / "config.json"
     document = json.loads(path.read_bytes())
-    mutants = []
-    for number in range(COUNT):
+    made = []
+    for number in range(mutants):
         part = ("options", "config", None)[number % 3]  # most of a document's values are versions and rules
         if part is None:
-            mutants.append(mutated(document, rng))
+            made.append(mutated(document, rng))
         else:
-            mutants.append(
-                with_raw(document, (part,), mutated(document[part], rng).decode("latin-1")).encode("latin-1")
-            )
-    check(base, mutants, path.write_bytes, capsys, (["resume"], ["report"]))
+            made.append(with_raw(document, (part,), mutated(document[part], rng).decode("latin-1")).encode("latin-1"))
+    check(base, made, path.write_bytes, capsys, (["resume"], ["report"]))
 
 
 def refused(folder, capsys, *words):

@@ -1,8 +1,11 @@
 """The policy that ships: its row in the default run, its flags, and its card with results."""
 
+import contextlib
 import dataclasses
+import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -26,19 +29,33 @@ def folder(tmp_path_factory):
     return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"))
 
 
+def ship(patch, folder):
+    """Let a folder come with the package."""
+    patch.setattr(learned_card, "SHIPPED", folder)
+    patch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
+    return folder
+
+
 @pytest.fixture
 def shipped(folder, monkeypatch):
-    """It comes with the package."""
-    monkeypatch.setattr(learned_card, "SHIPPED", folder)
-    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
-    return folder
+    """The policy comes with the package."""
+    return ship(monkeypatch, folder)
 
 
 @pytest.fixture
 def absent(tmp_path, monkeypatch):
     """No policy comes with the package."""
-    monkeypatch.setattr(learned_card, "SHIPPED", tmp_path / "nowhere")
-    monkeypatch.setattr(run, "_recorder", lambda *_: None)
+    ship(monkeypatch, tmp_path / "nowhere")
+
+
+@pytest.fixture(scope="module")
+def default_run(folder, tmp_path_factory):
+    """Folder of a default run, and what it printed."""
+    out = tmp_path_factory.mktemp("default") / "out"
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        ship(patch, folder)
+        assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
+    return out, printed.getvalue()
 
 
 def stand_ins(**changes):
@@ -56,11 +73,9 @@ def rows(text):
     return [row for row in found if row[0].islower()]
 
 
-def test_the_default_run_has_a_row_that_sees(shipped, tmp_path, capsys):
+def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
     """Experts' rows, then one of the learned policy: its first task and tracker, in table, pages and report."""
-    out = tmp_path / "out"
-    assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
-    printed = capsys.readouterr().out
+    out, printed = default_run
     assert rows(printed)[-1] == ("vis_navi", "twist2", "learned", "base", "3")
     assert sum(row[2] == "learned" for row in rows(printed)) == 1 and printed.count("| task ") == 1
     assert "report of their own are in learned/" in printed
@@ -79,13 +94,11 @@ def test_the_default_run_has_a_row_that_sees(shipped, tmp_path, capsys):
     assert "  3 episodes, all finished" in again and rows(again) == rows(printed)
 
 
-def test_a_row_that_is_a_link_is_refused(shipped, tmp_path, capsys):
+def test_a_row_that_is_a_link_is_refused(default_run, shipped, tmp_path, capsys):
     """A link in place of the row's folder is not written through."""
-    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
-    assert main(["--device", "cpu", "--out", str(out)], stand_ins()) == 0
+    out, elsewhere = shutil.copytree(default_run[0], tmp_path / "out"), tmp_path / "elsewhere"
     (out / "learned").rename(elsewhere)
     (out / "learned").symlink_to(elsewhere)
-    capsys.readouterr()
     assert main(["resume", str(out)], stand_ins()) == 2
     assert "learned: is a link; a run writes inside its own folder only" in capsys.readouterr().err
 

@@ -398,7 +398,7 @@ def test_comparisons_keep_their_level_and_find_what_is_there():
 
 def test_the_summary_names_the_spreads_that_its_intervals_are_held_to(monkeypatch):
     """The line of `statistics` says up to which spread an interval must cover, where that is declared and measured."""
-    monkeypatch.setattr(error_rates, "COMPARISONS", 20)
+    monkeypatch.setattr(error_rates, "COMPARISONS", 1)
     found = error_rates._statistics(SimpleNamespace(options=SimpleNamespace(quick=False)))
     held = [row for row in found.sheets[0].rows if row[2] == "coverage" and "trainings differ" in row[0]]
     spreads = {
@@ -414,6 +414,7 @@ def test_a_test_that_errs_is_found_out(monkeypatch):
     monkeypatch.setattr(
         "arena_newton.eval.statistics.comparison.stratified_test", lambda strata: stratified_test(strata) / 4
     )
+    monkeypatch.setattr(error_rates, "SPREADS", ())
     assert any(not tally.holds for tally in error_rates.tallies(150, episodes=20))
 
 
@@ -421,7 +422,9 @@ def test_an_interval_of_episodes_alone_is_found_out(monkeypatch):
     """An interval that leaves out how much trainings differ does not cover them in the same simulation."""
     monkeypatch.setattr("arena_newton.eval.statistics.trainings.MATCHED_SPREAD", 0.0)
     monkeypatch.setattr("arena_newton.eval.statistics.trainings.ENOUGH", 99)
-    held = {t.what: t.holds for t in error_rates.tallies(60) if t.case == "2 recipes, trainings differ by 20 points"}
+    monkeypatch.setattr(error_rates, "DIFFERENCES", ())
+    monkeypatch.setattr(error_rates, "SPREADS", (0.2,))
+    held = {tally.what: tally.holds for tally in error_rates.tallies(60)}
     assert len(held) == 4 and not held["interval over 3 trainings, one task, covers"]
 
 

@@ -4,6 +4,7 @@ Processes are objects of this process, which answer in turn; a test says when on
 """
 
 import contextlib
+import functools
 import itertools
 import json
 import re
@@ -97,21 +98,22 @@ class InlineProcess:
         self.fake.killed += 1
 
 
+def stand_in(patch, dies=lambda: False, cores=2.0):
+    """Put a stand-in with so many cores in the place of Ray and of the processes of --jobs."""
+    found = InlineRay(dies, cores)
+    patch.setattr(ray_backend, "ray", found)
+    patch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
+    patch.setattr(local_backend, "LocalProcess", functools.partial(InlineProcess, found))
+    patch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
+    patch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
+    patch.setenv("OMP_NUM_THREADS", "2")
+    return found
+
+
 @pytest.fixture
 def inline(monkeypatch):
     """Makes a stand-in for processes, of Ray or of --jobs."""
-
-    def make(dies=lambda: False, cores=2.0):
-        found = InlineRay(dies, cores)
-        monkeypatch.setattr(ray_backend, "ray", found)
-        monkeypatch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
-        monkeypatch.setattr(local_backend, "LocalProcess", lambda gpu: InlineProcess(found, gpu))
-        monkeypatch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
-        monkeypatch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
-        monkeypatch.setenv("OMP_NUM_THREADS", "2")
-        return found
-
-    return make
+    return functools.partial(stand_in, monkeypatch)
 
 
 @pytest.fixture
@@ -149,13 +151,20 @@ def merged(out, target):
     return found
 
 
-@pytest.mark.parametrize("by", [RAY, JOBS], ids=["ray", "jobs"])
-def test_the_same_bytes_as_without(inline, suite, alone, tmp_path, by):
+@pytest.fixture(scope="module")
+def undisturbed(alone):
+    """Folder of the suite that two processes played without any loss, and the stand-in for Ray."""
+    with pytest.MonkeyPatch.context() as patch:
+        fake, out = stand_in(patch), alone.parent / "ray"
+        assert call(alone.parent / "small.toml", out) == 0
+        return out, fake
+
+
+def test_the_same_bytes_as_without(undisturbed, alone, tmp_path):
     """Journals, tables and reports of all cells are those of one process, and suite.json says the same of them."""
-    inline()
-    assert call(suite, tmp_path / "out", by=by) == 0
-    assert merged(tmp_path / "out", tmp_path / "a") == merged(alone, tmp_path / "b")
-    found, wanted = read_suite(tmp_path / "out"), read_suite(alone)
+    out, _ = undisturbed
+    assert merged(out, tmp_path / "a") == merged(alone, tmp_path / "b")
+    found, wanted = read_suite(out), read_suite(alone)
     for mine, its in zip(found.cells, wanted.cells, strict=True):
         assert (mine.id, mine.config, mine.status, mine.finished, mine.successes, mine.device) == (
             (its.id, its.config, "done", 4, its.successes, "cpu")
@@ -163,27 +172,21 @@ def test_the_same_bytes_as_without(inline, suite, alone, tmp_path, by):
         assert mine.wall_s > 0 and load_cell(found, mine).document["status"]["state"] == "success"
 
 
-def test_one_crew_for_all_cells(inline, suite, tmp_path):
-    """Processes are asked for once; a cell is opened by who plays it; who is free before the end helps another."""
-    fake = inline()
-    assert call(suite, tmp_path / "out") == 0
+def test_one_crew_for_all_cells(undisturbed):
+    """Processes are asked for once; a cell is opened by who plays it; who is free before the end helps another.
+
+    A process plays the cells of its environment first.
+    """
+    _, fake = undisturbed
     assert fake.actors == 2 and {number for number, _ in fake.opened} == {1, 2}
     folders = [folder for _, folder in fake.opened]
     assert len(set(folders)) == 6 and len(folders) < 12
-
-
-def test_environments_last_from_cell_to_cell(inline, suite, tmp_path):
-    """A process plays the cells of its environment first."""
-    fake = inline()
-    assert call(suite, tmp_path / "out") == 0
     groups = {n: [folder.split("/")[-2:] for number, folder in fake.opened if number == n] for n in (1, 2)}
     changes = sum(before != after for one in groups.values() for before, after in itertools.pairwise(one))
     assert changes <= 4, groups
 
 
-@pytest.mark.parametrize(
-    ("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (7, JOBS), (11, RAY), (17, JOBS)], ids=str
-)
+@pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)

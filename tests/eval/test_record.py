@@ -7,7 +7,6 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -25,34 +24,40 @@ from arena_newton.eval.play.run import Factories
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.settings import CameraConfig
+from tests.children import Child
 
 SMALL = ["--task", "boxing", "--size", "64x64", "--engine", "mujoco", "--device", "cpu"]
 COUNT = 3
-BRIEF = [*SMALL, "--episodes", str(COUNT), "--max-steps", "40"]
-"""Episodes that are cut off, where what counts is what happens to their files."""
+BRIEF = [*SMALL, "--episodes", str(COUNT)]
+"""Episodes in worlds where each soon succeeds: what counts is what happens to their files."""
+
+
+@pytest.fixture(scope="module")
+def parts(quick_worlds):
+    """Worlds of such episodes."""
+    return Factories(env=quick_worlds)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory, kept_worlds):
-    """Three disturbed episodes of boxing, recorded in three worlds without interruption."""
+    """A whole disturbed episode of boxing."""
     folder = tmp_path_factory.mktemp("recorded") / "whole"
-    command = ["record", *SMALL, "--episodes", str(COUNT), "--worlds", "3", "--out", str(folder)]
-    assert main(command, Factories(env=kept_worlds)) == 0
+    assert main(["record", *SMALL, "--episodes", "1", "--out", str(folder)], Factories(env=kept_worlds)) == 0
     return folder
 
 
 @pytest.fixture(scope="module")
-def brief(tmp_path_factory, kept_worlds):
-    """Three episodes that are cut off, recorded in three worlds without interruption."""
+def brief(tmp_path_factory, parts):
+    """Three brief episodes, recorded in three worlds without interruption."""
     folder = tmp_path_factory.mktemp("brief") / "whole"
-    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) == 0
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], parts) == 0
     return folder
 
 
 @pytest.fixture
-def copied(recorded, tmp_path):
-    """A copy of the recorded folder that a test may damage."""
-    return shutil.copytree(recorded, tmp_path / "copy")
+def copied(brief, tmp_path):
+    """A copy of the brief episodes that a test may damage."""
+    return shutil.copytree(brief, tmp_path / "copy")
 
 
 def contents(folder):
@@ -70,20 +75,18 @@ def same(folder, other):
 
 def test_every_row_has_its_frame_and_the_label_is_clean(recorded):
     """Frames equal rows, the executed action has noise that the stored one lacks, and the seed is a demonstration's."""
-    files = episode_files([recorded])
-    assert len(files) == COUNT
-    for file in map(EpisodeFile, files):
-        with av.open(str(file.video("front"))) as video:
-            pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-        assert len(pictures) == file.rows == file.integer("vision_rgb_video_num_frames")
-        assert pictures[0].shape == (64, 64, 3) and not pictures[0][:7].max() > 40  # black bars of a square
-        histogram = file.array("arena_vision_histogram", 3, 256)
-        mean = (histogram * np.arange(256)).sum(axis=1) / histogram.sum(axis=1)
-        assert np.allclose(np.mean(pictures, axis=(0, 1, 2)), mean, atol=3)
-        noise = file.array("arena_executed_action") - file.action
-        assert not noise[0].any() and (noise[:, 9:38].std(axis=0) > 0.01).all() and not noise[:, 38:].any()
-        assert file.text("arena_seed_range") == "demonstration" and file.integer("arena_episode_seed") >> 31 == 1
-        assert set(file.phases) >= {"approach", "go round", "step up"}
+    (file,) = map(EpisodeFile, episode_files([recorded]))
+    with av.open(str(file.video("front"))) as video:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(pictures) == file.rows == file.integer("vision_rgb_video_num_frames")
+    assert pictures[0].shape == (64, 64, 3) and not pictures[0][:7].max() > 40  # black bars of a square
+    histogram = file.array("arena_vision_histogram", 3, 256)
+    mean = (histogram * np.arange(256)).sum(axis=1) / histogram.sum(axis=1)
+    assert np.allclose(np.mean(pictures, axis=(0, 1, 2)), mean, atol=3)
+    noise = file.array("arena_executed_action") - file.action
+    assert not noise[0].any() and (noise[:, 9:38].std(axis=0) > 0.01).all() and not noise[:, 38:].any()
+    assert file.text("arena_seed_range") == "demonstration" and file.integer("arena_episode_seed") >> 31 == 1
+    assert set(file.phases) >= {"approach", "go round", "step up"}
 
 
 def test_an_episodes_facts_name_no_folder_time_or_number_of_worlds(recorded):
@@ -95,31 +98,31 @@ def test_an_episodes_facts_name_no_folder_time_or_number_of_worlds(recorded):
     assert str(recorded) not in text and "started_at" not in text
 
 
-def test_the_journal_names_the_files(recorded):
+def test_the_journal_names_the_files(brief):
     """An episode's line names its NPZ and its videos, below the folder."""
-    records, _ = read_journal(recorded / "episodes.jsonl")
+    records, _ = read_journal(brief / "episodes.jsonl")
     assert len(records) == COUNT
     for record in records:
         assert set(record.media) == {"episode", "front"}
-        assert all((recorded / path).is_file() for path in record.media.values())
+        assert all((brief / path).is_file() for path in record.media.values())
 
 
-def test_bytes_do_not_depend_on_worlds(brief, tmp_path, kept_worlds):
+def test_bytes_do_not_depend_on_worlds(brief, tmp_path, parts):
     """One world after the other writes the same bytes as three at once."""
     other = tmp_path / "one"
-    assert main(["record", *BRIEF, "--worlds", "1", "--out", str(other)], Factories(env=kept_worlds)) == 0
+    assert main(["record", *BRIEF, "--worlds", "1", "--out", str(other)], parts) == 0
     same(brief, other)
 
 
-def test_bytes_do_not_depend_on_who_encodes(brief, tmp_path, kept_worlds, monkeypatch):
+def test_bytes_do_not_depend_on_who_encodes(brief, tmp_path, parts, monkeypatch):
     """Processes write the same bytes as threads."""
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
     other = tmp_path / "processes"
-    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(other)], Factories(env=kept_worlds)) == 0
+    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(other)], parts) == 0
     same(brief, other)
 
 
-def test_a_killed_encoder_stops_the_run(brief, tmp_path, kept_worlds, monkeypatch, capsys):
+def test_a_killed_encoder_stops_the_run(brief, tmp_path, parts, monkeypatch, capsys):
     """Kill -9 of a process that encodes is one error, exit code not 0, without partial files; resumed, all is there."""
     folder, started, frames = tmp_path / "killed", [], []
     popen, add = subprocess.Popen, film_pool.FilmPool.add
@@ -137,46 +140,38 @@ def test_a_killed_encoder_stops_the_run(brief, tmp_path, kept_worlds, monkeypatc
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
     monkeypatch.setattr(film_pool.subprocess, "Popen", start)
     monkeypatch.setattr(film_pool.FilmPool, "add", kill)
-    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) != 0
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], parts) != 0
     said = capsys.readouterr().err
     assert "a process that encodes pictures ended (SIGKILL; out of memory?)" in said and "Traceback" not in said
     assert len(started) == 2 and not list(folder.rglob("*.part"))
     monkeypatch.undo()
-    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    assert main(["resume", str(folder)], parts) == 0
     same(brief, folder)
 
 
-@pytest.mark.release
-def test_kills_lose_at_most_what_was_running(recorded, tmp_path):
-    """Killed twice at random moments and resumed, with other hash seeds, a recording has the bytes of a whole one."""
-    folder, draw = tmp_path / "killed", random.Random(5)
-    command = [sys.executable, "-m", "arena_newton.eval", "record", *SMALL, "--episodes", str(COUNT)]
-    command += ["--worlds", "2", "--out", str(folder)]
-    kept = 0
-    for attempt in range(2):
-        environment = os.environ | {"PYTHONHASHSEED": str(attempt + 1)}
-        run = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            began = time.monotonic()
-            while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
-                time.sleep(0.05)
-            time.sleep(draw.uniform(0.5, 4.0))
-        finally:
-            run.send_signal(signal.SIGKILL)
-            run.wait()
+def test_kills_lose_at_most_what_was_running(brief, tmp_path, parts):
+    """Killed twice at random moments and resumed by another process, a recording has the bytes of a whole one."""
+    folder, draw, kept = tmp_path / "killed", random.Random(5), 0
+    for command in (["record", *BRIEF, "--worlds", "2", "--out", str(folder)], ["resume", str(folder)]):
+        run = Child("quick_worlds", command)
+        began = time.monotonic()
+        while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
+            time.sleep(0.02)
+        time.sleep(draw.uniform(0.0, 0.3))
+        run.kill()
+        run.wait()
         records, _ = read_journal(folder / "episodes.jsonl")
         assert len(records) >= kept
         kept = len(records)
         for record in records:  # whatever is journalled is whole
             assert EpisodeFile(folder / record.media["episode"]).rows == record.steps
-        command = [sys.executable, "-m", "arena_newton.eval", "resume", str(folder)]
-    assert main(["resume", str(folder)]) == 0
-    same(recorded, folder)
+    assert main(["resume", str(folder)], parts) == 0
+    same(brief, folder)
     assert not list(folder.rglob("*.part"))
 
 
 @pytest.mark.parametrize("processes", [0, 2])
-def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, kept_worlds, monkeypatch, capsys, processes):
+def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, parts, monkeypatch, capsys, processes):
     """Ctrl-C while pictures are encoded: code 130, no process or partial file stays; resumed, the bytes are equal."""
     folder, started, rendered = tmp_path / "interrupted", [], []
     popen, render = subprocess.Popen, Camera.render
@@ -187,7 +182,7 @@ def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, kept_worlds, monkeypatch,
 
     def interrupt(self, *pictures):
         rendered.append(1)
-        if len(rendered) == 60:
+        if len(rendered) == 25:
             assert list(folder.glob("episodes/**/*.part"))
             signal.raise_signal(signal.SIGINT)
         return render(self, *pictures)
@@ -195,33 +190,33 @@ def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, kept_worlds, monkeypatch,
     monkeypatch.setattr(recording, "encoding_processes", lambda: processes)
     monkeypatch.setattr(film_pool.subprocess, "Popen", start)
     monkeypatch.setattr(Camera, "render", interrupt)
-    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(folder)], Factories(env=kept_worlds)) == 130
+    assert main(["record", *BRIEF, "--worlds", "2", "--out", str(folder)], parts) == 130
     said = capsys.readouterr()
     assert "resume" in said.out + said.err and "Traceback" not in said.err
     assert len(started) == processes and not any(Path(f"/proc/{child.pid}").exists() for child in started)
     assert not list(folder.rglob("*.part"))
     assert len(read_journal(folder / "episodes.jsonl")[0]) < COUNT
     monkeypatch.undo()
-    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    assert main(["resume", str(folder)], parts) == 0
     same(brief, folder)
 
 
-def test_missing_and_torn_files_are_recorded_again(recorded, copied, kept_worlds, capsys):
+def test_missing_and_torn_files_are_recorded_again(brief, copied, parts, capsys):
     """A removed video, a cut NPZ and another video: those episodes are played again, with the same bytes."""
     files = episode_files([copied])
     files[0].write_bytes(files[0].read_bytes()[:-100])
     EpisodeFile(files[1]).video("front").unlink()
-    other = EpisodeFile(episode_files([recorded])[0]).video("front")
+    other = EpisodeFile(episode_files([brief])[0]).video("front")
     shutil.copyfile(other, EpisodeFile(files[2]).video("front"))
     lines = (copied / "episodes.jsonl").read_bytes()
-    assert main(["resume", str(copied)], Factories(env=kept_worlds)) == 0
+    assert main(["resume", str(copied)], parts) == 0
     assert "of 3 episodes the recording is missing" in capsys.readouterr().err
-    same(recorded, copied)
+    same(brief, copied)
     assert (copied / "episodes.jsonl").read_bytes().startswith(lines)  # the journal only grows
     assert len(load_run(copied).records) == COUNT
 
 
-def test_a_full_disk_loses_no_finished_episode(brief, tmp_path, kept_worlds, monkeypatch, capsys):
+def test_a_full_disk_loses_no_finished_episode(brief, tmp_path, parts, monkeypatch, capsys):
     """A file that cannot be written stops the run by its name, exit code 2; resumed, the bytes are those of a whole."""
     folder, written = tmp_path / "full", []
     write = demonstration.write_episode
@@ -233,7 +228,7 @@ def test_a_full_disk_loses_no_finished_episode(brief, tmp_path, kept_worlds, mon
         write(path, arrays, **options)
 
     monkeypatch.setattr(demonstration, "write_episode", full)
-    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], Factories(env=kept_worlds)) == 2
+    assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], parts) == 2
     said = capsys.readouterr().err
     assert "disk full" in said and written[1] in said and "resume" in said
     records, _ = read_journal(folder / "episodes.jsonl")
@@ -241,19 +236,18 @@ def test_a_full_disk_loses_no_finished_episode(brief, tmp_path, kept_worlds, mon
     assert written[0] in done and written[1] not in done
     assert not (folder / "episodes" / written[1]).exists() and not list(folder.rglob("*.part"))
     monkeypatch.undo()
-    assert main(["resume", str(folder)], Factories(env=kept_worlds)) == 0
+    assert main(["resume", str(folder)], parts) == 0
     same(brief, folder)
 
 
-def test_only_successes_are_kept_in_rounds(recorded, tmp_path, kept_worlds, capsys):
+def test_only_successes_are_kept_in_rounds(brief, tmp_path, parts, capsys):
     """Under a cap that the slowest episode misses, another attempt is made; what failed is counted, and has no file."""
-    steps = {r.repeat: r.steps for r in load_run(recorded).records if r.repeat < 2}
+    steps = {r.repeat: r.steps for r in load_run(brief).records if r.repeat < 2}
     slowest = max(steps, key=steps.get)
     cap = steps[slowest] - 1
     folder = tmp_path / "successes"
     flags = ["--episodes", "2", "--only-success", "--max-steps", str(cap), "--cameras", "--worlds", "2"]
-    command = ["record", "--task", "boxing", "--engine", "mujoco", "--device", "cpu", *flags, "--out", str(folder)]
-    code = main(command, Factories(env=kept_worlds))
+    code = main(["record", *SMALL[:2], *SMALL[4:], *flags, "--out", str(folder)], parts)
     records = load_run(folder).records
     kept = [r for r in records if r.outcome == "success"]
     assert slowest not in {r.repeat for r in kept} and len(records) > 2
@@ -265,7 +259,7 @@ def test_only_successes_are_kept_in_rounds(recorded, tmp_path, kept_worlds, caps
     assert json.loads((folder / "results.json").read_text())["complete"] is True
 
 
-def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, kept_worlds, monkeypatch):
+def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, parts, monkeypatch):
     """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
     renders = []
     render = Camera.render
@@ -277,7 +271,7 @@ def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, kept_worlds, m
         return policy
 
     command = ["record", *BRIEF, "--episodes", "1", "--out", str(tmp_path / "seen")]
-    assert main(command, Factories(env=kept_worlds, policy=seeing)) == 0
+    assert main(command, Factories(env=parts.env, policy=seeing)) == 0
     (record,) = load_run(tmp_path / "seen").records
     assert len(renders) <= record.steps + 1
     assert (tmp_path / "seen" / record.media["front"]).read_bytes() == (brief / record.media["front"]).read_bytes()
@@ -292,8 +286,7 @@ def test_links_are_not_followed(copied, tmp_path, capsys, name):
     assert "is a link" in capsys.readouterr().err
 
 
-def test_a_folder_keeps_its_pictures(recorded, capsys):
+def test_a_folder_keeps_its_pictures(brief, capsys):
     """Another size in the same folder is refused."""
-    command = ["record", "--task", "boxing", "--size", "96x96", "--engine", "mujoco", "--device", "cpu"]
-    assert main([*command, "--episodes", str(COUNT), "--out", str(recorded)]) == 2
+    assert main(["record", *BRIEF, "--size", "96x96", "--out", str(brief)]) == 2
     assert "was begun with --record-size 64x64" in capsys.readouterr().err

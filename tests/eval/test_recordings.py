@@ -9,8 +9,9 @@ import torch
 
 from arena_newton import policies
 from arena_newton.errors import InputError
-from arena_newton.eval import __main__ as command_line
+from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.recordings import ActionRecorder
+from arena_newton.eval.play.run import Factories
 from arena_newton.files.own_files import PARTIAL
 from arena_newton.interfaces import Observation
 from arena_newton.rules.seeding import policy_seed
@@ -27,10 +28,16 @@ def ends(folder):
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def play(kept_worlds):
+    """Runs the command `run` in environments that stay."""
+    return lambda *flags: main(["run", *flags], Factories(env=kept_worlds))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory, play):
     """A run of the expert in closed loop, with its actions."""
     out = tmp_path_factory.mktemp("recorded") / "run"
-    assert command_line.main(["run", *RUN, "--policy", "expert", "--actions", "--out", str(out)]) == 0
+    assert play(*RUN, "--policy", "expert", "--actions", "--out", str(out)) == 0
     return out
 
 
@@ -47,7 +54,7 @@ def test_what_ran_stands_with_the_results(recorded):
     assert len(hashes) == 1 and '"environment": "' in hashes.pop()
 
 
-def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path):
+def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path, play):
     """Open loop, the same tracker comes to the same end, margin included, with other worlds beside it."""
     files = sorted(p.name for p in (recorded / "actions").iterdir())
     assert files == ["boxing_base_s3_r0.npz", "boxing_base_s3_r1.npz"]
@@ -55,15 +62,15 @@ def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path):
         assert arrays["action"].shape == (50, 40) and str(arrays["task"]).startswith("Isaac-Move-Boxing")
     out = tmp_path / "again"
     replay = ["--policy", f"replay:{recorded / 'actions'}"]
-    assert command_line.main(["run", *RUN[:-1], "1", *replay, "--out", str(out)]) == 0
+    assert play(*RUN[:-1], "1", *replay, "--out", str(out)) == 0
     assert ends(out) == ends(recorded)
 
 
-def test_another_tracker_gets_the_same_actions(recorded, tmp_path):
+def test_another_tracker_gets_the_same_actions(recorded, tmp_path, play):
     """The swap: sonic plays what was decided while twist2 walked, and ends elsewhere."""
     out = tmp_path / "swap"
     replay = ["--policy", f"replay:{recorded / 'actions'}", "--tracker", "sonic"]
-    assert command_line.main(["run", *RUN, *replay, "--out", str(out)]) == 0
+    assert play(*RUN, *replay, "--out", str(out)) == 0
     assert {r["outcome"] for r in journal(out)} <= {"timeout", "fall", "success"}
     assert ends(out) != ends(recorded)
 
@@ -80,22 +87,22 @@ def test_an_episode_without_a_recording_is_an_error_of_its_own(recorded):
     assert np.isfinite(chunk.actions).all() and chunk.actions[0].any()
 
 
-def test_modes_are_kept_apart(tmp_path, capsys):
+def test_modes_are_kept_apart(tmp_path, capsys, play):
     """A run of two modes plays again, each mode with its own recordings; another task is refused first."""
     out, again = tmp_path / "run", tmp_path / "again"
     modes = [*RUN, "--mode", "base", "execution", "--max-steps", "20", "--repeats", "1"]
-    assert command_line.main(["run", *modes, "--policy", "stand", "--actions", "--out", str(out)]) == 0
+    assert play(*modes, "--policy", "stand", "--actions", "--out", str(out)) == 0
     replay = ["--policy", f"replay:{out / 'actions'}"]
-    assert command_line.main(["run", *modes, *replay, "--out", str(again)]) == 0
+    assert play(*modes, *replay, "--out", str(again)) == 0
     first, second = (sorted((r["mode"], r["outcome"], r["margin"]) for r in journal(f)) for f in (out, again))
     assert first == second and {r["policy"] for r in journal(again)} == {"replay:run"}
     capsys.readouterr()
-    assert command_line.main(["run", "--task", "football", *replay, "--out", str(tmp_path / "no")]) == 2
+    assert play("--task", "football", *replay, "--out", str(tmp_path / "no")) == 2
     assert "no recording of task football" in capsys.readouterr().err
-    assert command_line.main(["run", *RUN, *replay, "--mode", "semantic", "--out", str(tmp_path / "no")]) == 2
+    assert play(*RUN, *replay, "--mode", "semantic", "--out", str(tmp_path / "no")) == 2
     assert "in mode semantic, only base, execution" in capsys.readouterr().err
     other = [*modes, "--seeds", "999", *replay, "--out", str(tmp_path / "no")]
-    assert command_line.main(["run", *other]) == 2
+    assert play(*other) == 2
     assert "but of other --seeds" in capsys.readouterr().err
 
 

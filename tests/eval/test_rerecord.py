@@ -10,25 +10,32 @@ import pytest
 
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, write_episode
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.play.run import Factories
 
 CPU = ["--engine", "mujoco", "--device", "cpu"]
 
 
 @pytest.fixture(scope="module")
-def bare(tmp_path_factory):
+def parts(quick_worlds):
+    """Worlds whose episodes soon succeed."""
+    return Factories(env=quick_worlds)
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory, parts):
     """Two disturbed episodes of boxing without pictures, recorded in two worlds."""
     folder = tmp_path_factory.mktemp("bare") / "source"
     command = ["record", "--task", "boxing", *CPU, "--episodes", "2", "--cameras", "--worlds", "2"]
-    assert main([*command, "--out", str(folder)]) == 0
+    assert main([*command, "--out", str(folder)], parts) == 0
     return folder
 
 
 @pytest.fixture(scope="module")
-def filmed(bare, tmp_path_factory):
+def filmed(bare, tmp_path_factory, parts):
     """The same with pictures of two cameras and depth, played in one world."""
     folder = tmp_path_factory.mktemp("filmed") / "out"
     cameras = ["--cameras", "front", "world", "--size", "64x48", "--depth", "--worlds", "1"]
-    assert main(["record", "--from", str(bare), *cameras, "--out", str(folder)]) == 0
+    assert main(["record", "--from", str(bare), *cameras, "--out", str(folder)], parts) == 0
     return folder
 
 
@@ -61,31 +68,31 @@ def test_cameras_are_added_and_nothing_else_changes(bare, filmed):
         assert bool(file.array("rerecord_any_success")) and float(file.array("rerecord_final_reward")) == 1.0
 
 
-def test_a_second_camera_joins_the_first_and_the_source_stays(filmed, tmp_path, capsys):
+def test_a_second_camera_joins_the_first_and_the_source_stays(filmed, tmp_path, capsys, parts):
     """Episodes with pictures get more: their videos are copied byte for byte, and no bit of the source changes."""
     before = digest(filmed)
     command = ["record", "--from", str(filmed), "--cameras", "left_wrist", "--size", "64x48", "--out", str(tmp_path)]
-    assert main(command) == 0
+    assert main(command, parts) == 0
     assert digest(filmed) == before
     old, new = (EpisodeFile(episode_files([folder])[0]) for folder in (filmed, tmp_path))
     assert new.cameras == ("front", "left_wrist", "world")
     assert new.video("front").read_bytes() == old.video("front").read_bytes()
     assert "largest deviation of a position from the recording: 0\n" in capsys.readouterr().out
     written = digest(tmp_path)
-    assert main(command) == 0  # what is there is not played again
+    assert main(command, parts) == 0  # what is there is not played again
     assert "0 to play again" in capsys.readouterr().out and digest(tmp_path) == written
 
 
-def test_another_motion_is_an_error_that_names_the_tick(bare, tmp_path, capsys):
+def test_another_motion_is_an_error_that_names_the_tick(bare, tmp_path, capsys, parts):
     """A changed action makes another motion: exit code 1 with the first tick at which a position differs."""
     source = EpisodeFile(episode_files([bare])[0])
     actions = source.array("arena_executed_action").copy()
-    actions[40, 9] += 0.3
+    actions[10, 9] += 0.3
     folder = changed(bare, tmp_path / "changed", arena_executed_action=actions)
     out = tmp_path / "out"
-    assert main(["record", "--from", str(folder), "--size", "64x48", "--out", str(out)]) == 1
+    assert main(["record", "--from", str(folder), "--size", "64x48", "--out", str(out)], parts) == 1
     said = capsys.readouterr().err
-    assert "arena_qpos: at tick 41 " in said and source.stem in said
+    assert "arena_qpos: at tick 11 " in said and source.stem in said
     assert not list(out.rglob("*.npz")) and not list(out.rglob("*.part")) and not list(out.rglob("*.mp4"))
 
 

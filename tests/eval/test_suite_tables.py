@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import io
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -133,12 +132,14 @@ def test_changed_runs_stand_beside_nothing(tmp_path, capsys, change, said):
     facts = {"family": "act", "facts": {"trackers": ["twist2"], "tasks": ["boxing"]}}
     for name in "ab":
         write_cell(tmp_path / name, cell_of("x", "x", "twist2", "boxing"), outcomes(9), policy_facts=facts, **change)
-    assert main(["tables", str(tmp_path / "a"), "--format", "md", "tex", "--out", str(tmp_path / "t")]) == 0
+    assert main(["tables", str(tmp_path / "a"), "--format", "md", "tex", "csv", "--out", str(tmp_path / "t")]) == 0
     assert said in capsys.readouterr().out
     text = (tmp_path / "t" / "tables.md").read_text()
     assert text.count(said) == text.count("\n## ") and not re.search(r"\| (paper|WB-WAM)", text)
     assert main(["tables", str(tmp_path / "a"), "--findings", "--out", str(tmp_path / "f")]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "f").exists()
+    assert main(["tables", str(tmp_path / "t" / "cells.csv"), "--findings", "--out", str(tmp_path / "f")]) == 2
+    assert "has no cell of ours that is a result" in capsys.readouterr().err and not (tmp_path / "f").exists()
     assert main(["report", str(tmp_path / "a"), "--table"]) == 0
     assert said in capsys.readouterr().out
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "c")]) == 0
@@ -411,9 +412,8 @@ def test_latex_is_whole(suite, tmp_path):
         assert (tmp_path / "tables.pdf").stat().st_size > 1000
 
 
-def test_several_trainings_of_a_recipe_have_a_table(tmp_path, monkeypatch):
+def test_several_trainings_of_a_recipe_have_a_table(tmp_path):
     """Policies `act#1` to `act#3` are one recipe: their successes, mean and standard deviation are one row."""
-    monkeypatch.setattr(os, "fsync", lambda file: None)
     plan = [(cell_of(f"act#{n}", "act", "sonic", "boxing"), outcomes(won)) for n, won in ((1, 30), (2, 36), (3, 42))]
     made = {t.name: t for t in suite_tables(read_cells([write_suite(tmp_path / "suite", plan)]).cells, paper_numbers())}
     shown = row(made["trainings"], "act", "sonic", "sonic", "Boxing", "base")

@@ -1,6 +1,6 @@
-"""A process that gives hundreds of damaged files to one reader and says what came of it; see `test_readers`.
+"""A process that gives damaged files to one reader and says what came of it; see `test_readers`.
 
-Run as `python mutants.py READER COUNT SEED FOLDER`; the last line of its output is a JSON object.
+Run as `python mutants.py READER COUNT FOLDER`; the last line of its output is a JSON object.
 """
 
 import copy
@@ -14,7 +14,7 @@ import sys
 import time
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,8 @@ WORDS = (
 )
 READY, DAMAGED = "accepted", "refused"
 Reader = Callable[[Path], None]
+Made = tuple[Reader, Callable[[], tuple[str, bytes]]]
+"""A reader, and name and content of its next damaged file."""
 
 
 def damaged(data: bytes, rng: random.Random, *, text: bool = False) -> bytes:
@@ -182,12 +184,12 @@ def judge_layer(path: Path) -> None:
         raise InputError(str(problems[0]))
 
 
-def usda(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def usda(folder: Path, rng: random.Random) -> Made:
     scene_files(folder)
     return judge_layer, lambda: ("mutant.usda", damaged(LAYER.encode(), rng, text=True))
 
 
-def usdc(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def usdc(folder: Path, rng: random.Random) -> Made:
     from pxr import Sdf
 
     scene_files(folder)
@@ -196,7 +198,7 @@ def usdc(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[s
     return judge_layer, lambda: ("mutant.usdc", damaged(data, rng))
 
 
-def usdz(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def usdz(folder: Path, rng: random.Random) -> Made:
     from pxr import Sdf
 
     scene_files(folder)
@@ -223,7 +225,7 @@ def usdz(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[s
     return judge_layer, made
 
 
-def images(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def images(folder: Path, rng: random.Random) -> Made:
     from PIL import Image
 
     (folder / "scene.usda").write_text(
@@ -243,7 +245,7 @@ def images(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple
     return read, lambda: ("mutant.png", damaged(rng.choice(kinds), rng))
 
 
-def motions(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def motions(folder: Path, rng: random.Random) -> Made:
     from arena_newton.trackers.motions.formats import read_file
     from arena_newton.trackers.motions.library import MotionLibrary
     from arena_newton.trackers.motions.load import Clip
@@ -258,7 +260,7 @@ def motions(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tupl
     return lambda path: void(read_file(path)), lambda: ("mutant.npz", zipped(rng.choice((library, beyond)), rng))
 
 
-def recordings(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def recordings(folder: Path, rng: random.Random) -> Made:
     from arena_newton.env import STAND_ACTION
     from arena_newton.policies.replay import ReplayEpisodes, ReplayPolicy
 
@@ -279,7 +281,7 @@ def recordings(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], t
     return read, lambda: ("runs/mutant.npz", zipped(arrays, rng))
 
 
-def datasets(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def datasets(folder: Path, rng: random.Random) -> Made:
     sys.path.insert(0, str(Path(__file__).parents[1] / "policies"))
     from original_dataset import write_dataset
 
@@ -307,7 +309,7 @@ def datasets(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tup
     return read, made
 
 
-def pickles(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def pickles(folder: Path, rng: random.Random) -> Made:
     from arena_newton.trackers.motions.formats import read_file
 
     fields = {
@@ -330,7 +332,7 @@ def pickles(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tupl
     return lambda path: void(read_file(path)), lambda: ("mutant.pkl", damaged(rng.choice(made), rng))
 
 
-def tables(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def tables(folder: Path, rng: random.Random) -> Made:
     from arena_newton.trackers.motions.formats import read_file
 
     row = ",".join(["0.1", "0", "0.8", "0", "0", "0.7071", "0.7071", *["0.05"] * 29])
@@ -338,7 +340,7 @@ def tables(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple
     return lambda path: void(read_file(path)), lambda: ("mutant.csv", damaged(data, rng, text=rng.random() < 0.7))
 
 
-def onnx(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def onnx(folder: Path, rng: random.Random) -> Made:
     sys.path.insert(0, str(Path(__file__).parents[1] / "trackers"))
     import onnx as library
     import torch
@@ -380,7 +382,7 @@ def onnx(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[s
     return lambda file: void(onnx_mlp.load(file, in_width=width, out_width=5)), made
 
 
-def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def safetensors(folder: Path, rng: random.Random) -> Made:
     import torch
 
     from arena_newton.robot.g1 import TWIST2_DRIVE, PhysicsRate
@@ -405,7 +407,7 @@ def safetensors(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], 
     return lambda path: void(weights_file.load(path)), made
 
 
-def shards(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
+def shards(folder: Path, rng: random.Random) -> Made:
     """Results folders of two shards of one plan, of which journal or configuration of one is damaged."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
     import contextlib
@@ -451,8 +453,8 @@ def shards(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple
     return read, made
 
 
-def comparisons(folder: Path, rng: random.Random) -> tuple[Reader, Callable[[], tuple[str, bytes]]]:
-    from damaged_comparisons import comparisons
+def comparisons(folder: Path, rng: random.Random) -> Made:
+    from tests.fuzz.damaged_comparisons import comparisons
 
     return comparisons(folder, rng, damaged)
 
@@ -461,24 +463,10 @@ def void(_: object) -> None:
     """Nothing is made of what was read."""
 
 
-READERS = {
-    f.__name__: f
-    for f in (
-        usda,
-        usdc,
-        usdz,
-        images,
-        motions,
-        recordings,
-        datasets,
-        pickles,
-        tables,
-        onnx,
-        safetensors,
-        shards,
-        comparisons,
-    )
-}
+ALL = (usda, usdc, usdz, images, motions, recordings, datasets, pickles, tables, onnx, safetensors, shards, comparisons)
+READERS = {reader.__name__: reader for reader in ALL}
+KEPT: dict[str, tuple[int, ...]] = {}
+"""Reader → numbers of files that meet a fault which the first 30 do not: they are read however few are asked for."""
 
 
 def held() -> int:
@@ -486,15 +474,14 @@ def held() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def results(reader: str, count: int, seed: int, folder: Path) -> Iterator[tuple[str, str]]:
-    rng = random.Random(seed)
+def results(reader: str, numbers: Iterable[int], folder: Path) -> Iterator[tuple[str, str]]:
+    rng = random.Random(1)
     read, made = READERS[reader](folder, rng)
     files = []
-    for number in range(count):
+    for number in numbers:
+        rng.seed(number)
         name, data = made()
-        path = folder / name
-        if reader == "usdc":
-            path = folder / f"mutant{number}.usdc"
+        path = folder / (f"mutant{number}.usdc" if reader == "usdc" else name)
         path.write_bytes(data)
         files.append(path)
         if reader != "usdc":
@@ -523,14 +510,15 @@ def once(read: Reader, path: Path) -> tuple[str, str]:
     return answer
 
 
-def main() -> None:
-    reader, count, seed, folder = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+def main(arguments: Sequence[str] | None = None) -> None:
+    reader, count, folder = arguments or sys.argv[1:]
     # Smaller than what is allowed, so that the test is quick; the counts are the same.
     limits.CRATE_MEMORY, limits.CRATE_SECONDS = 128 * limits.MIB, 5.0
     counts: dict[str, int] = {}
     faults: list[str] = []
+    numbers = sorted({*range(int(count)), *KEPT.get(reader, ())})
     start, base = time.monotonic(), 0
-    for answer, text in results(reader, count, seed, folder):
+    for answer, text in results(reader, numbers, Path(folder)):
         base = base or held()
         counts[answer] = counts.get(answer, 0) + 1
         if text:

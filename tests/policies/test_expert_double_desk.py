@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded_actions import Actions
 
 from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
@@ -33,33 +34,6 @@ def episodes(env, numbers=EPISODES):
     return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, SEED, i)) for i in numbers]
 
 
-class Actions:
-    """Recorder of the canonical actions of each episode."""
-
-    wants_observation = False
-
-    def __init__(self):
-        """Nothing recorded."""
-        self.of, self._seed = {}, {}
-
-    def start(self, env, world, episode):
-        """An episode begins."""
-        self._seed[world] = episode.episode_seed
-        self.of[episode.episode_seed] = []
-
-    def before_physics(self, env, observation, action):
-        """Keep a tick's actions."""
-        for world, seed in self._seed.items():
-            self.of[seed].append(action[world].numpy().copy())
-
-    def tick(self, env):
-        """Nothing to do."""
-
-    def finish(self, env, world, result):
-        """The episode has ended."""
-        del self._seed[world]
-
-
 @pytest.fixture(scope="module")
 def played(env):
     """Both episodes from beginning to end: results, actions by seed, and ticks in which the sill was touched."""
@@ -73,7 +47,7 @@ def played(env):
 
     actions = Actions()
     results = Rollout(env, policies.get("expert"), episodes(env), recorder=[actions], on_tick=count).run()
-    return results, actions.of, touched
+    return results, actions.rows, touched
 
 
 def test_two_episodes_end_in_the_crate(played):
@@ -90,7 +64,7 @@ def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
     results, actions, _ = played
     column = ACTION["joint_pos"].start + CANONICAL_JOINTS.index("right_wrist_roll_joint")
     for episode, result in zip(episodes(env), results, strict=True):
-        roll = np.array(actions[episode.episode_seed])[:, column]
+        roll = torch.stack(actions[episode.episode_seed]).numpy()[:, column]
         begins = {name: tick + len(roll) - result.steps for name, tick in result.phases}
         assert (roll[: begins["hover"]] == 0.0).all()
         grasp = roll[begins["hover"] : begins["step back"]]
@@ -105,10 +79,10 @@ def test_worlds_are_independent(env, played):
     _, first, _ = played
     second = Actions()
     Rollout(env, policies.get("expert"), episodes(env, (5, *EPISODES[:1])), recorder=[second], max_steps=200).run()
-    (shared,) = set(first) & set(second.of)
-    again = second.of[shared]
-    assert len(again) >= 200 and np.array_equal(first[shared][: len(again)], again)
-    assert not np.array_equal(*second.of.values())
+    (shared,) = set(first) & set(second.rows)
+    again, other = (torch.stack(second.rows[seed]) for seed in sorted(second.rows, key=shared.__ne__))
+    assert len(again) >= 200 and torch.equal(torch.stack(first[shared])[: len(again)], again)
+    assert not torch.equal(again, other)
 
 
 @pytest.fixture

@@ -5,31 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded_actions import Actions
 
 from arena_newton import policies, trackers
 from arena_newton.data.readers.label_protocols import encode_v4
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.interfaces import Recorder
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import V4Policy, read_by
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-
-
-class Acted(Recorder):
-    """Keeps the actions of every episode from its step 0 to its end, by its seed."""
-
-    def __init__(self):
-        self.worlds, self.rows = {}, {}
-
-    def start(self, env, world, episode):
-        self.worlds[world] = self.rows.setdefault(episode.episode_seed, [])
-
-    def before_physics(self, env, observation, action):
-        for world in np.flatnonzero(env.active & (env.tick >= 0)):
-            self.worlds[world].append(action[world].numpy().copy())
 
 
 class Table(Policy):
@@ -69,7 +55,7 @@ def episodes(env, n):
 def played():
     """Boxing, the expert's results and its actions of v3.1 by seed."""
     env = ArenaEnv("boxing", tracker=trackers.get("twist2", None), worlds=2, engine="mujoco")
-    kept = Acted()
+    kept = Actions(startup=False)
     results = Rollout(env, policies.get("expert"), episodes(env, 3), recorder=kept).run()
     rows = {seed: np.stack(rows) for seed, rows in kept.rows.items()}
     yield env, results, rows
@@ -81,7 +67,7 @@ def test_labels_of_v4_move_the_robot_as_v3_1_does(played, length):
     """The expert's actions, encoded to v4 and read by --labels v4, succeed as they are, and rows agree within 1e-4."""
     env, results, actions = played
     labels = {seed: encode_v4(rows) for seed, rows in actions.items()}
-    kept = Acted()
+    kept = Actions(startup=False)
     again = Rollout(env, read_by(Table(labels, length), "v4"), episodes(env, 3), recorder=kept).run()
     assert [result.outcome for result in again] == ["success"] * 3 == [result.outcome for result in results]
     for seed, result in zip(actions, again, strict=True):

@@ -2,10 +2,7 @@
 
 import base64
 import json
-import shutil
 import socket
-import ssl
-import subprocess
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -530,22 +527,16 @@ def test_close_breaks_off_what_waits(server):
     assert not asking.is_alive()
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate, and it is not here")
-def test_https(server, tmp_path):
+def test_https(server, certificate):
     """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
-    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
-    make = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -keyout"
-    subprocess.run([*make.split(), str(key), "-out", str(certificate)], check=True, capture_output=True)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, key)
-    server.socket = context.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
+    server.socket = certificate[1].wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
     url = server.url.replace("http:", "https:")
     policy = RemotePolicy(url, timeout=5.0, retries=0)
     with pytest.raises(InputError, match="--remote-insecure does without"):
         policy.check()
     policy.close()
     server.behave = {1.0: "slow"}
-    policy = RemotePolicy(url, timeout=1.0, retries=0, verify_ssl=False)
+    policy = RemotePolicy(url, timeout=0.5, retries=0, verify_ssl=False)
     policy.check()
     for _ in range(2):
         start = time.monotonic()

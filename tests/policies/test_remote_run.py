@@ -150,7 +150,7 @@ def test_example_server_with_pictures(monkeypatch):
 def test_entry_points_and_options(monkeypatch):
     """A package's policy is found; one that is called like another, or makes none, is one line."""
     points = []
-    monkeypatch.setattr(registry, "_offered", lambda path: SimpleNamespace(select=lambda group: points))
+    monkeypatch.setattr(registry, "_installed", lambda group, path: points)
 
     def offer(name, factory, package="theirs"):
         points.append(SimpleNamespace(name=name, load=lambda: factory, dist=SimpleNamespace(name=package)))

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="needs the extra [data]")
 
 from original_dataset import ACTION_NAMES, features, write_dataset
+from recorded_actions import Actions
 
 from arena_newton import policies, trackers
 from arena_newton.cli import extras
@@ -17,26 +18,11 @@ from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.interfaces import Recorder
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 
 V4 = {"robot_type": "unitree_g1_gmt_cmd_v4", "vla_protocol": {"version": "4"}}
-
-
-class Acted(Recorder):
-    """Keeps the actions of every episode from its step 0 to its end, by its seed."""
-
-    def __init__(self):
-        self.worlds, self.rows = {}, {}
-
-    def start(self, env, world, episode):
-        self.worlds[world] = self.rows.setdefault(episode.episode_seed, [])
-
-    def before_physics(self, env, observation, action):
-        for world in np.flatnonzero(env.active & (env.tick >= 0)):
-            self.worlds[world].append(action[world].numpy().copy())
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +31,7 @@ def played():
     env = ArenaEnv("boxing", tracker=trackers.get("twist2", None), worlds=2, engine="mujoco")
     seeds = [seeding.episode_seed(env.spec.gym_id, 0, repeat) for repeat in range(2)]
     episodes = [SimpleNamespace(episode_seed=seed, object_seed=seeding.object_seed(seed)) for seed in seeds]
-    kept = Acted()
+    kept = Actions(startup=False)
     results = Rollout(env, policies.get("expert"), episodes, recorder=kept).run()
     assert [result.outcome for result in results] == ["success"] * 2
     yield env, episodes, results, [np.stack(kept.rows[seed]) for seed in seeds]
@@ -70,7 +56,7 @@ def test_the_originals_data_move_the_robot(played, tmp_path):
     root = write_dataset(tmp_path / "HSI_boxing" / "twist2_refpose_v3_1", actions)
     policy = policies.get(f"replay:{root}#1")
     policy.check_task("boxing", "base", [episodes[1].episode_seed])
-    kept = Acted()
+    kept = Actions(startup=False)
     (again,) = Rollout(env, policy, episodes[1:], recorder=kept).run()
     assert (again.outcome, again.steps) == ("success", results[1].steps)
     np.testing.assert_array_equal(np.stack(kept.rows[episodes[1].episode_seed]), actions[1])

@@ -1,6 +1,6 @@
 """Trackers are found by name and bad input is answered with one clear line."""
 
-from importlib.metadata import EntryPoint, EntryPoints
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -107,7 +107,7 @@ def test_entry_point(monkeypatch):
         EntryPoint("theirs", "arena_newton.trackers.pd:from_checkpoint", base.ENTRY_POINT_GROUP),
         EntryPoint("broken", "no_such_package:make", base.ENTRY_POINT_GROUP),
     ]
-    monkeypatch.setattr(registry, "_offered", lambda path: EntryPoints(points))
+    monkeypatch.setattr(registry, "_installed", lambda group, path: points)
     assert {"theirs", "broken"} <= set(trackers.names())
     assert trackers.get("theirs").name == "pd"
     assert "no_such_package" in message("broken")
@@ -116,7 +116,7 @@ def test_entry_point(monkeypatch):
 def test_built_in_names_are_taken(monkeypatch):
     """A package that offers a tracker under a built-in name is refused: neither of the two is taken silently."""
     points = [EntryPoint("twist2", "theirs:make", base.ENTRY_POINT_GROUP)]
-    monkeypatch.setattr(registry, "_offered", lambda path: EntryPoints(points))
+    monkeypatch.setattr(registry, "_installed", lambda group, path: points)
     assert "offered by this package and by another package" in message("twist2")
     assert trackers.get("pd").name == "pd"
     with pytest.raises(InputError, match="'sonic': is built in"):

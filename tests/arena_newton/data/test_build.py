@@ -205,7 +205,7 @@ def record(folder, worlds):
         seeds = {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
         episodes.append(SimpleNamespace(index=repeat, group_seed=0, repeat=repeat, **about, **seeds))
     recorder = DemonstrationRecorder(folder, cameras={"front": CameraConfig(width=64, height=64)}, facts={"code": "x"})
-    list(Rollout(env, StandPolicy(), episodes, max_steps=25, recorder=recorder).run())
+    list(Rollout(env, StandPolicy(), episodes, max_steps=12, recorder=recorder).run())
     recorder.close()
     return folder
 
@@ -256,7 +256,7 @@ def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_pa
     assert content(out) == whole
     shutil.rmtree(out)
     unfinished = 0
-    for number in range(12):
+    for number in range(6):
         # The first one at once: it certainly meets a build at work.
         _, left = build_and_kill(recordings, out, chance.uniform(0.0, 1.1 * duration) if number else 0.0)
         unfinished += left

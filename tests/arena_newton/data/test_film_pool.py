@@ -4,9 +4,8 @@ import contextlib
 import errno
 import os
 import signal
-import subprocess
-import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,24 +13,10 @@ import torch
 
 from arena_newton.data.recording.encoding import FilmThreads, Pictured
 from arena_newton.data.recording.film_pool import FilmPool
+from tests.children import Child
 
 WORLDS, TICKS, SIZE = 5, 14, 64
 CPU = torch.device("cpu")
-
-CHILD = """
-import sys, time
-import torch
-from pathlib import Path
-from arena_newton.data.recording.encoding import Pictured
-from arena_newton.data.recording.film_pool import FilmPool
-pool = FilmPool(2, 1)
-pool.bind({"front": Pictured(2, 64, 64, False)}, torch.device("cpu"))
-reels = [pool.open(pool.join(), Path(sys.argv[1]) / f"{n}.mp4", Path(sys.argv[1]) / f"{n}.raw", 50) for n in range(2)]
-pool.add("front", reels, torch.zeros(2, 64, 64, 3, dtype=torch.uint8), None)
-pool.wait()
-print(len(list(Path(sys.argv[1]).glob("*.part"))), flush=True)
-time.sleep(60)
-"""
 
 
 def pictures(tick):
@@ -167,15 +152,25 @@ def test_a_killed_process_is_one_clear_error(tmp_path):
     assert len(list(tmp_path.glob("*.mp4"))) == 1 and not list(tmp_path.glob("*.part"))
 
 
+def half_filmed(arguments):
+    """A process that has begun two films."""
+    pool = FilmPool(2, 1)
+    reels = begin(pool, Path(arguments[0]), worlds=2, depth=False)
+    pool.add("front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
+    pool.wait()
+    print(len(list(Path(arguments[0]).glob("*.part"))), flush=True)
+    time.sleep(600)
+
+
 def test_no_process_outlives_a_killed_recorder(tmp_path):
     """Kill -9 of the recording process ends its encoders, which leave its partial files to the next call."""
-    run = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    run = Child(f"{__name__}:half_filmed", [str(tmp_path)])
     try:
-        assert run.stdout.readline() == "2\n"
+        assert run.lines(1) == ["2"], run.printed()
         encoders = children(run.pid, 2)
     finally:
         run.kill()
-        run.communicate()
+        run.wait(30)
     until = time.monotonic() + 10
     while any(os.path.exists(f"/proc/{one}") for one in encoders) and time.monotonic() < until:
         time.sleep(0.05)

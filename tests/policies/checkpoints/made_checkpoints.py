@@ -4,16 +4,20 @@ import json
 
 import numpy as np
 import torch
+import torchvision
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
 from tokenizers import Tokenizer, models, pre_tokenizers
+from torch import nn
+from torchvision.models.resnet import BasicBlock, ResNet
 from transformers import CLIPConfig, CLIPModel, PreTrainedTokenizerFast
 
 from arena_newton.data.readers.label_protocols import encode_v4
 from arena_newton.policies import Observation
+from arena_newton.policies.learned import act_network
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.robot.canonical import STAND_ACTION
 
@@ -22,6 +26,27 @@ SIDE = 64
 CHUNK = 6
 """Actions that are executed of a chunk."""
 FRONT, STATE, TASK = "observation.images.front", "observation.state", "observation.environment_state"
+WIDTHS = (16, 32, 64, 128)
+"""Channels of the stages of a vision encoder, a quarter of a ResNet18's."""
+
+
+class NarrowResNet(ResNet):
+    """ResNet18 of fewer channels: 0.7 million weights."""
+
+    def __init__(self, norm_layer=nn.BatchNorm2d, **_):
+        nn.Module.__init__(self)
+        self._norm_layer, self.inplanes, self.dilation, self.groups, self.base_width = norm_layer, WIDTHS[0], 1, 1, 64
+        self.conv1, self.bn1 = nn.Conv2d(3, WIDTHS[0], 7, stride=2, padding=3, bias=False), norm_layer(WIDTHS[0])
+        self.relu, self.maxpool = nn.ReLU(inplace=True), nn.MaxPool2d(3, stride=2, padding=1)
+        for stage, width in enumerate(WIDTHS, start=1):
+            self.add_module(f"layer{stage}", self._make_layer(BasicBlock, width, 2, 1 if stage == 1 else 2))
+        self.avgpool, self.fc = nn.AdaptiveAvgPool2d(1), nn.Linear(WIDTHS[-1], 1)
+
+
+def install(patch):
+    """Let every ResNet18 be narrow, LeRobot's and ours."""
+    patch.setattr(torchvision.models, "resnet18", NarrowResNet)
+    patch.setattr(act_network, "WIDTHS", WIDTHS)
 
 
 def made_clip(folder):

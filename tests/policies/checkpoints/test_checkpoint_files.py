@@ -1,11 +1,9 @@
 """Files of a checkpoint: the original's are read as its server does, foreign and damaged ones are one clear error."""
 
 import json
-import os
 import random
 import shutil
 import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.policies.lerobot import checkpoint_network
+from arena_newton.policies.lerobot import checkpoint_network, hub_folder
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.lerobot.picture_preparation import PicturePreparation, PictureStep
 
@@ -374,16 +372,15 @@ def test_a_name_of_the_hub_that_was_fetched_before(checkpoints, tmp_path, monkey
         policies.get("lerobot:owner/act")
 
 
-def test_a_hub_that_does_not_answer(monkeypatch):
+def test_a_hub_that_does_not_answer(tmp_path, monkeypatch):
     """Is given up after a few seconds, with one clear error."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        code = (
-            "from arena_newton.policies.lerobot import hub_folder as h; h.PATIENCE = 0.2; h.fetched('nobody/nothing')"
-        )
-        variables = dict(os.environ, HF_ENDPOINT=address, HF_HUB_OFFLINE="0")
-        done = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, timeout=60)
-    assert "InputError: --policy lerobot:nobody/nothing: is no folder here" in done.stderr
+        monkeypatch.setattr(hub_folder, "PATIENCE", 0.2)
+        for name, value in {"ENDPOINT": address, "HF_HUB_OFFLINE": False, "HF_HUB_CACHE": str(tmp_path)}.items():
+            monkeypatch.setattr(huggingface_hub.constants, name, value)
+        with pytest.raises(InputError, match="--policy lerobot:nobody/nothing: is no folder here, .* timed out"):
+            hub_folder.fetched("nobody/nothing")
 
 
 def test_a_picture_of_another_size_is_refused(checkpoints):

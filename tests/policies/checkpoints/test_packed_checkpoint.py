@@ -362,7 +362,6 @@ def test_damaged_files_are_one_error(packed, tmp_path):
             LearnedPolicy(folder).check()
         for name, content in kept.items():
             (folder / name).write_bytes(content)
-        LearnedPolicy(folder).check()
 
     whole = {path.name: path.read_bytes() for path in folder.iterdir()}
     weights = load_file(folder / "model.safetensors")
@@ -388,6 +387,7 @@ def test_damaged_files_are_one_error(packed, tmp_path):
     refused(f"{path.name}: action: std is 0 in all 40 numbers", whole)
     edit(folder / CARD_FILE, tasks=["football"])
     refused("card.json: tasks names football, which its task vector lacks", whole)
+    LearnedPolicy(folder).check()
 
 
 @pytest.mark.parametrize(

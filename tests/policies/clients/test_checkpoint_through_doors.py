@@ -31,7 +31,7 @@ SEEDS = (3, 5, 8)
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT that turns this way and that."""
     about = made_checkpoints.facts(labels="v4", realign=REALIGN, family="act")
     return made_checkpoints.save(tmp_path_factory.mktemp("act"), "act", facts=about, spread=0.1)

@@ -1,10 +1,7 @@
 """Servers that fail: only the world concerned ends as an error, nothing waits forever, a run stops where it must."""
 
 import json
-import shutil
 import socket
-import ssl
-import subprocess
 import threading
 import time
 
@@ -431,16 +428,10 @@ def test_close_breaks_off_what_waits(running):
     assert not asking.is_alive()
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate (Debian: openssl)")
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
-def test_wss(protocol, tmp_path):
+def test_wss(protocol, certificate):
     """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
-    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
-    make = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=localhost -keyout"
-    subprocess.run([*make.split(), str(key), "-out", str(certificate)], check=True, capture_output=True)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, key)
-    server = SocketServer(protocol, facts(), ssl=context)
+    server = SocketServer(protocol, facts(), ssl=certificate[1])
     url = f"{protocol}+wss://127.0.0.1:{server.port}"
     policy = policies.get(f"remote:{url}", timeout=3.0, retries=0)
     with pytest.raises(InputError, match="--remote-insecure does without"):

@@ -1,4 +1,4 @@
-"""Hundreds of damaged replies of each protocol: one line about one world, never a crash, a hang or a filled memory."""
+"""Damaged replies of each protocol: one line about one world, never a crash, a hang or a filled memory."""
 
 import random
 import resource
@@ -22,7 +22,7 @@ ROWS = answer(np.zeros(64), None, 1, 0)
 PARTS = {name: ROWS[None][..., part] for name, part in ACTION.items()}
 
 
-def mutants(good, count, seed):
+def broken(good, count, seed):
     """Damaged copies of a message."""
     rng = random.Random(seed)
     return [damaged(good, rng) for _ in range(count)]
@@ -86,14 +86,20 @@ def drive(server, policy, count):
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
-def test_broken_replies_are_an_error_of_their_world(protocol):
+def test_broken_replies_are_an_error_of_their_world(protocol, mutants):
     """Damaged frames through real sockets: each is the error of one world, and the next episode is served."""
     if protocol == "openpi":
         good = openpi_codec.pack_answer(ROWS, 1.0)
-        replies = [*mutants(good, 300, 1), *hand_made(), "text", "", "Traceback\n" * 500 + "\x1b[31mValueError: no\x07"]
+        replies = [
+            *broken(good, mutants, 1),
+            *hand_made(),
+            "text",
+            "",
+            "Traceback\n" * 500 + "\x1b[31mValueError: no\x07",
+        ]
     else:
         good = vla_eval_codec.pack_action(ROWS, 3, 1.0)
-        replies = [*mutants(good, 300, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
+        replies = [*broken(good, mutants, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
     server = Answering(protocol, list(replies))
     policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0, backoff=0.01)
     policy.check()
@@ -104,7 +110,7 @@ def test_broken_replies_are_an_error_of_their_world(protocol):
     server.close()
 
 
-def gr00t_cases():
+def gr00t_cases(mutants):
     """Answers of GR00T's server that are none."""
     sound = gr00t_packed([PARTS, {}])
     arrays = [npy(np.zeros((1, 4, 29)))["as_npy"]]
@@ -120,16 +126,16 @@ def gr00t_cases():
     cases += [
         gr00t_packed(value) for value in (None, [], {}, [[]], [{}], "text", 5, [PARTS["joint_pos"]], [None, PARTS])
     ]
-    return [*mutants(sound, 400, 3), *cases]
+    return [*broken(sound, mutants, 3), *cases]
 
 
-def test_broken_replies_of_gr00t():
+def test_broken_replies_of_gr00t(mutants):
     """Damaged answers are refused in one line, or hold actions; nothing is unpickled and no memory filled."""
     server = Gr00tServer(declared=facts())
     policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
     policy.check()
     before, refused = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0
-    cases = gr00t_cases()
+    cases = gr00t_cases(mutants)
     for case in cases:
         try:
             policy.checked(policy._batch_rows(policy._read(" (infer)", case), 1)[0])

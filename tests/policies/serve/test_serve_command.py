@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import shutil
 import signal
 import socket
 import ssl
@@ -27,6 +26,7 @@ from arena_newton.policies.serve.__main__ import main
 from arena_newton.policies.serve.serve_command import _first_task, make_policy, serve_policy
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION
+from tests.children import Child
 
 
 @pytest.mark.parametrize(
@@ -111,19 +111,14 @@ def test_a_token_that_no_header_can_carry(capsys, monkeypatch):
 @pytest.mark.parametrize(("stop", "protocol"), [(signal.SIGINT, "openpi"), (signal.SIGTERM, "arena")])
 def test_the_command_serves_until_it_is_interrupted(stop, protocol):
     """It says where it listens, answers, and at Ctrl-C prints what it did and ends with 0."""
-    command = [sys.executable, "-m", "arena_newton", "policies", "serve", "--policy", "stand"]
-    process = subprocess.Popen(
-        [*command, "--protocol", protocol, "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    flags = ["--policy", "stand", "--protocol", protocol, "--port", "0"]
+    process = Child("arena_newton.__main__", ["policies", "serve", *flags])
     try:
-        first, second = process.stdout.readline(), process.stdout.readline()
+        first, second, third, *_ = process.lines(3)
         assert "chunks of 50 actions of v3.1 at 50 Hz, no picture" in first
         port = int(second.split("127.0.0.1:")[1].split(",")[0])
         scheme = "http" if protocol == "arena" else protocol
-        assert process.stdout.readline() == f"eval asks it by --policy remote:{scheme}://127.0.0.1:{port}\n"
+        assert third == f"eval asks it by --policy remote:{scheme}://127.0.0.1:{port}"
         if protocol == "openpi":
             with connect(f"ws://127.0.0.1:{port}") as client:
                 client.recv(timeout=10)
@@ -158,19 +153,9 @@ def test_labels_of_what_is_served(monkeypatch):
         assert make_policy(ServeOptions(policy=spec, **flags), "cpu").labels == labels
 
 
-def test_tls(served, tmp_path):
+def test_tls(served, certificate):
     """With a certificate the server speaks wss and https, and nothing without it."""
-    if shutil.which("openssl") is None:
-        pytest.skip("needs the program openssl (Debian package openssl)")
-    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
-        + ["-addext", "subjectAltName=IP:127.0.0.1", "-keyout", str(key), "-out", str(cert)],
-        check=True,
-        capture_output=True,
-    )
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(cert, key)
+    cert, context = certificate
     trust = ssl.create_default_context(cafile=str(cert))
     one = served(Remembers(), tls=context)
     with connect(f"wss://127.0.0.1:{one.port}", ssl=trust) as client:
@@ -183,17 +168,9 @@ def test_tls(served, tmp_path):
     policy.close()
 
 
-def test_a_key_with_a_pass_phrase(capsys, tmp_path):
+def test_a_key_with_a_pass_phrase(capsys, tmp_path, make_certificate):
     """A key that must be asked for is refused by name; nothing waits at a terminal."""
-    if shutil.which("openssl") is None:
-        pytest.skip("needs the program openssl (Debian package openssl)")
-    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-passout", "pass:secret", "-days", "2"]
-        + ["-subj", "/CN=localhost", "-keyout", str(key), "-out", str(cert)],
-        check=True,
-        capture_output=True,
-    )
+    cert, key = make_certificate(tmp_path, "-passout", "pass:secret")
     assert main(["--policy", "stand", "--port", "0", "--tls-cert", str(cert), "--tls-key", str(key)]) == 2
     assert capsys.readouterr().err == f"error: --tls-key {key}: has a pass phrase, expected a key without one\n"
 

@@ -28,7 +28,7 @@ def _offline(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def checkpoints(tmp_path_factory):
+def checkpoints(narrow_resnet, tmp_path_factory):
     """Family → folder: ACT in v4 with realignment, and a Diffusion Policy, which draws noise."""
     root = tmp_path_factory.mktemp("served")
     act = save(root / "act", "act", facts=facts(family="act", labels="v4", realign=0.002))

@@ -116,5 +116,5 @@ def wait_for(check, what: str, seconds: float = READY):
         found = check()
         if found:
             return found
-        time.sleep(0.1)
+        time.sleep(0.05)
     pytest.fail(f"no {what} after {seconds:.0f} s", pytrace=False)

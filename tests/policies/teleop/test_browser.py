@@ -1,12 +1,9 @@
 """The page: who may open it, what drives the robot, when it stops. Distances are judged, not times."""
 
 import json
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.error
@@ -17,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import READY, Chromium, wait_for
+from test_session import standing_view
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -24,9 +22,12 @@ from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.errors import InputError
 from arena_newton.policies.protocols.ports import LOCAL, bind
 from arena_newton.policies.teleop import __main__ as command
-from arena_newton.policies.teleop.browser import DEAD_MAN
+from arena_newton.policies.teleop.browser import DEAD_MAN, BrowserSource
 from arena_newton.policies.teleop.driving import RANGES, Held
 from arena_newton.policies.teleop.page_server import TAKEN_OVER, UNFIT, PageServer, new_token
+from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.g1 import TICK
+from tests.children import Child
 
 FOREIGN = "http://evil.example"
 """A web site in another tab."""
@@ -138,7 +139,7 @@ def fill(server: PageServer) -> None:
     """Send the page so much that it does not fit into what lies between."""
     note = "x" * 2**24
     server.publish({"tick": 1, "note": note}, None)
-    time.sleep(0.5)
+    time.sleep(0.2)
 
 
 def test_a_page_that_reads_nothing_delays_nobody(server):
@@ -226,57 +227,116 @@ def test_wrong_flags_are_one_line(flags, named, capsys):
     assert error.startswith("error: ") and named in error
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A browser for all pages."""
+    with Chromium(tmp_path_factory.mktemp("browser") / "profile") as page:
+        yield page
+
+
+@pytest.fixture
+def page(browser, server):
+    """The page of a server without a world."""
+    browser.open(server.url)
+    wait_for(lambda: server.held()[1] < READY, "message of the page")
+    return browser
+
+
+def test_keys_and_stick_drive_and_leaving_the_window_lets_go(server, page):
+    """Held keys and the dragged stick arrive as deflections; when released, or without focus, nothing is held."""
+
+    def driven(forward=0, left=0, turn=0):
+        def check() -> bool:
+            held, _ = server.held()
+            return tuple(np.sign([held.forward, held.left, held.turn])) == (forward, left, turn)
+
+        wait_for(check, f"deflection {forward, left, turn}")
+
+    for key, deflection in (("w", {"forward": 1}), ("a", {"left": 1}), ("e", {"turn": -1})):
+        page.key(key, True)
+        driven(**deflection)
+        page.key(key, False)
+        driven()
+    x, y = page.value(
+        "(({x,y,width,height}) => [x+width/2, y+height/2])(document.getElementById('stick').getBoundingClientRect())"
+    )
+    page.mouse("mousePressed", x, y)
+    page.mouse("mouseMoved", x, y + 60)
+    driven(forward=-1)
+    page.mouse("mouseReleased", x, y + 60)
+    driven()
+    page.key("w", True)
+    driven(forward=1)
+    page.value("window.dispatchEvent(new Event('blur'))")
+    driven()
+    page.key("w", False)
+
+
+def test_a_page_that_hangs_or_leaves_stops_the_robot(server, page):
+    """No message for 0.3 s is nobody: with a page that hangs, and after one that goes, the actions come to a stand."""
+    assert DEAD_MAN == 0.3
+    source, view = BrowserSource(server), standing_view()
+    source.begin(view)
+
+    def speed() -> float:
+        walked = [source.wish(view).action[ACTION["root_xy_delta"]] for _ in range(30)]
+        return float(np.linalg.norm(walked, axis=1).max()) / TICK
+
+    page.key("w", True)
+    wait_for(lambda: speed() > 0.4, "walk")
+    page.call("Debugger.enable")
+    page.call("Debugger.pause")
+    wait_for(lambda: speed() < 0.01, "stand while the page hangs")
+    assert server.connected and server.held()[0].forward == 1.0, "its socket is open and the key held"
+    page.call("Debugger.resume")
+    page.call("Debugger.disable")
+    wait_for(lambda: speed() > 0.4, "walk of the page that is back")
+    page.open("about:blank")
+    wait_for(lambda: speed() < 0.01, "stand without a page")
+    assert not server.connected
+
+
 class Session:
     """The command in a process of its own."""
 
     def __init__(self, folder: Path, *flags: str):
-        self.log = folder / "log.txt"
-        environment = os.environ | {"OMP_NUM_THREADS": "2"}
         arguments = ["browser", "--task", "football", "--port", "0", "--out", str(folder / "saved"), *flags]
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "arena_newton.policies.teleop", *arguments],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-            )
+        self.process = Child("arena_newton.policies.teleop.__main__", arguments)
 
     @property
     def url(self) -> str:
         """Address of the page."""
 
         def look() -> str | None:
+            said, complaints = self.process.printed()
             if self.process.poll() is not None:
-                pytest.fail(f"the session ended:\n{self.log.read_text()}", pytrace=False)
-            found = re.search(r"open (http://\S+)", self.log.read_text())
+                pytest.fail(f"the session ended:\n{said}{complaints}", pytrace=False)
+            found = re.search(r"open (http://\S+)", said)
             return found and found[1]
 
         return wait_for(look, "address in the log")
 
     def end(self) -> str:
         """Ctrl-C; what it said."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
-            self.process.wait(timeout=READY)
-        return self.log.read_text()
+        self.process.send_signal(signal.SIGINT)
+        return "".join(self.process.communicate(READY))
 
 
 @pytest.fixture(scope="module")
-def running(tmp_path_factory):
+def running(browser, tmp_path_factory):
     """A session with a world's view, and a page that is open."""
-    folder = tmp_path_factory.mktemp("browser")
+    folder = tmp_path_factory.mktemp("session")
     one = Session(folder, "--ego-size", "64x48")
     try:
-        with Chromium(folder / "profile") as page:
-            page.open(one.url)
-            page.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
-            yield one, page, folder / "saved"
+        browser.open(one.url)
+        browser.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
+        yield one, browser, folder / "saved"
     finally:
         one.end()
 
 
 def place(page: Chromium) -> np.ndarray:
-    """Where the robot is [m]."""
+    """Position of the robot [m]."""
     return np.array(str(page.value("document.body.dataset.position")).split(), dtype=float)
 
 
@@ -296,82 +356,39 @@ def still(page: Chromium) -> np.ndarray:
     return before[0]
 
 
-def walked(page: Chromium, start: np.ndarray, metres: float) -> None:
-    """Wait until the robot is so far from a point."""
-    wait_for(lambda: np.linalg.norm((place(page) - start)[:2]) > metres, f"walk of {metres} m")
-
-
 def test_the_page_shows_the_world(running):
-    """Task, head camera, state and the view of the world arrive, and no policy of the page forbids one of them."""
+    """Task, head camera, state and the view arrive; viser's socket opens for its own page with the token alone."""
     _, page, _ = running
     assert "football" in str(page.value("document.getElementById('task').textContent"))
+    frame = str(page.value("document.getElementById('frame').src"))
+    # A browser that draws the world without a GPU takes more time than all the rest.
+    page.value("document.getElementById('frame').src = 'about:blank'")
     page.wait("document.getElementById('picture').naturalWidth == 64", "picture of the head camera")
     page.wait("document.getElementById('driven').textContent == 'you drive'", "page that drives")
-    assert "websocket=ws://127.0.0.1" in str(page.value("document.getElementById('frame').src"))
-
-
-def test_the_view_needs_token_and_origin(running):
-    """The socket of viser opens for its own page with the token, and for nobody else."""
-    _, page, _ = running
-    frame = str(page.value("document.getElementById('frame').src"))
-    own, inner = re.match(r"(http://[^/]+)/\?websocket=(ws://\S+)", frame).groups()
+    own, inner = re.match(r"(http://[^/]+)/\?websocket=(ws://127.0.0.1\S+)", frame).groups()
     options = {"subprotocols": ["viser-v1.1.1"], "open_timeout": READY}
     with connect(inner, origin=own, **options):
         pass
     for url, origin in ((inner, FOREIGN), (inner.rsplit("/", 1)[0], own), (inner[:-3] + "abc", own)):
         with pytest.raises(InvalidStatus):
             connect(url, origin=origin, **options)
-    # A browser that draws the world without a GPU takes more time than all the rest, and nobody looks any more.
-    page.value("document.getElementById('frame').src = 'about:blank'")
 
 
-def test_a_held_key_walks_and_a_released_one_stops(running):
-    """The robot walks while `w` is held, to its left with `a`, and stands when they are released."""
-    _, page, _ = running
-    start = still(page)
-    page.key("w", True)
-    walked(page, start, 0.4)
-    page.key("w", False)
-    ahead = still(page) - start
-    assert ahead[1] > 0.4 and abs(ahead[0]) < 0.5 * ahead[1], "football faces along y"
-    start = still(page)
-    page.key("a", True)
-    walked(page, start, 0.2)
-    page.key("a", False)
-    aside = still(page) - start
-    assert aside[0] < -0.15 and abs(aside[1]) < -aside[0]
-
-
-def test_the_stick_walks_and_leaving_the_window_stops(running):
-    """The stick is dragged with a mouse; a key that is held when the window loses its focus is let go."""
-    _, page, _ = running
-    start = still(page)
-    x, y = page.value(
-        "(({x,y,width,height}) => [x+width/2, y+height/2])(document.getElementById('stick').getBoundingClientRect())"
-    )
-    page.mouse("mousePressed", x, y)
-    page.mouse("mouseMoved", x, y + 60)
-    walked(page, start, 0.3)
-    page.mouse("mouseReleased", x, y + 60)
-    back = still(page) - start
-    assert back[1] < -0.25
-    start = still(page)
-    page.key("w", True)
-    walked(page, start, 0.1)
-    page.value("window.dispatchEvent(new Event('blur'))")
-    still(page)
-    page.key("w", False)
-
-
-def test_a_recorded_episode_is_saved(running):
-    """Record, walk, save: the file is an episode whose robot walked; its name is on the page."""
+def test_a_recorded_walk_is_saved(running):
+    """The robot walks ahead while `w` is held, to its left with `a`, and stands then; saved, it is an episode."""
     one, page, folder = running
     page.value("document.getElementById('record').click()")
     page.wait("document.body.dataset.recording == 'recording' && Number(document.body.dataset.tick) > 0", "recording")
-    start = place(page)
-    page.key("w", True)
-    walked(page, start, 0.3)
-    page.key("w", False)
+    moved, at = {}, place(page)
+    for key, metres in (("w", 0.3), ("a", 0.15)):
+        start = at
+        page.key(key, True)
+        wait_for(lambda start=start, far=metres: np.linalg.norm((place(page) - start)[:2]) > far, f"walk of {metres} m")
+        page.key(key, False)
+        at = still(page)
+        moved[key] = at - start
+    assert moved["w"][1] > 0.3 and abs(moved["w"][0]) < 0.5 * moved["w"][1], "football faces along y"
+    assert moved["a"][0] < -0.1 and abs(moved["a"][1]) < -moved["a"][0]
     page.value("document.getElementById('save').click()")
     page.wait("document.body.dataset.recording == 'saved'", "saved episode")
     (file,) = folder.glob("*.npz")
@@ -380,34 +397,6 @@ def test_a_recorded_episode_is_saved(running):
     position = episode.array("robot_root_position")
     assert np.linalg.norm(position[-1, :2] - position[0, :2]) > 0.2
     assert episode.text("arena_policy") == "teleop-browser"
-
-
-@pytest.mark.release
-def test_a_socket_that_closes_or_stalls_stops_the_robot(running):
-    """No message for 0.3 s is nobody: a page that hangs, and one that goes, leave a robot that stands."""
-    one, page, _ = running
-    assert DEAD_MAN == 0.3
-    page.wait("Number(document.body.dataset.tick) > 0", "world that runs")
-    start = still(page)
-    page.key("w", True)
-    walked(page, start, 0.3)
-    # The page hangs with the key held; the socket stays open.
-    page.value("{ const end = performance.now() + 3000; while (performance.now() < end); }")
-    hung = page.value("document.body.dataset.position")
-    page.key("w", False)
-    at = still(page)
-    assert np.linalg.norm((at - start)[:2]) < 1.2, "3 s of walking are 1.7 m"
-    assert hung is not None
-    start = still(page)
-    page.key("w", True)
-    walked(page, start, 0.2)
-    page.open("about:blank")
-    token_page = one.url
-    time.sleep(1.5)
-    page.open(token_page)
-    page.wait("Number(document.body?.dataset.tick) > 0", "world that runs")
-    first = place(page)
-    assert np.linalg.norm((still(page) - first)[:2]) < 0.05, "it stood before the page was back"
 
 
 def test_the_end_says_how_real_the_time_was(running):

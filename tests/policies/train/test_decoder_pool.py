@@ -21,6 +21,7 @@ from arena_newton.policies.train.frames import decoder_pool
 from arena_newton.policies.train.frames.decoder_pool import DecoderPool, decoding_processes
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
 from arena_newton.policies.train.frames.frame_store import episode_films, load_frames
+from tests.children import Child
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
 
 CPU = torch.device("cpu")
@@ -171,21 +172,21 @@ def test_ctrl_c_leaves_nothing(rows):
     assert not decoders() and not shared_files()
 
 
-def test_processes_end_with_a_training_that_is_killed(rows):
+def idle_pool(_):
+    """A process that has asked for no pictures yet, and says who would decode them."""
+    pool = DecoderPool(64, 64, threads=1, processes=2)
+    print(*(one.process.pid for one in pool._workers), flush=True)
+    time.sleep(600)
+
+
+def test_processes_end_with_a_training_that_is_killed():
     """`kill -9` of whoever asked for pictures leaves no process."""
-    root = Path(decoder_pool.__file__).parents[4]
-    code = (
-        "import time; from arena_newton.policies.train.frames.decoder_pool import DecoderPool\n"
-        "pool = DecoderPool(64, 64, threads=1, processes=2)\n"
-        "print(*(one.process.pid for one in pool._workers), flush=True)\ntime.sleep(600)"
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(root)])}
-    with subprocess.Popen([sys.executable, "-P", "-c", code], stdout=subprocess.PIPE, env=environment) as training:
-        numbers = training.stdout.readline().split()
-        training.kill()
-    assert len(numbers) == 2
+    training = Child(f"{__name__}:idle_pool", [])
+    numbers = " ".join(training.lines(1)).split()
+    training.kill()
+    assert len(numbers) == 2, training.printed()
     limit = time.monotonic() + 300  # a process hears of it when its libraries are loaded
-    while any(running(number.decode()) for number in numbers):
+    while any(running(number) for number in numbers):
         assert time.monotonic() < limit
         time.sleep(0.05)
 
@@ -233,15 +234,17 @@ def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypa
     assert torch.equal(load_frames([rows], CPU, processes=2).pictures, wanted.pictures)
 
 
+def pool_without_input(_):
+    """A pool of a process whose standard input is closed; 0 if its memory is in no stream's position."""
+    os.close(0)
+    with DecoderPool(64, 64, threads=1, processes=1) as pool:
+        return int(pool._fd <= 2)
+
+
 def test_processes_start_where_the_standard_input_is_closed():
     """Whoever started the training may have closed its input: memory is not in its position."""
-    root = Path(decoder_pool.__file__).parents[4]
-    code = (
-        "import os; os.close(0)\nfrom arena_newton.policies.train.frames.decoder_pool import DecoderPool\n"
-        "with DecoderPool(64, 64, threads=1, processes=1) as pool:\n    assert pool._fd > 2\n"
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)])}
-    subprocess.run([sys.executable, "-P", "-c", code], env=environment, check=True)
+    child = Child(f"{__name__}:pool_without_input", [])
+    assert child.wait(300) == 0, child.printed()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,10 @@
 """Every family through the trainer at its smallest: two steps, one more after a resume, a checkpoint that opens."""
 
+import contextlib
+import csv
+import json
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -11,19 +16,22 @@ from tests.policies.train.stock_lerobot import opened
 
 
 @pytest.mark.parametrize("family", ["diffusion", "flow", "pi05"])
-def test_a_family_is_trained_and_opens(family, dataset, tmp_path):
-    """The trainer takes each family as it is, goes on after an interruption, and LeRobot opens what it wrote."""
+def test_a_family_is_trained_and_opens(family, dataset, tmp_path, narrow_resnet):
+    """Two steps with held-out losses and a resumed third; LeRobot opens it, and no file names where it grew."""
     out = tmp_path / "run"
-    given = {"device": "cpu", "quiet": True}
-    train(PolicyTrainOptions(policy=family, recipe="small", dataset=(dataset,), out=out, steps=2, **given))
-    train(PolicyTrainOptions(resume=out, steps=3, **given))
+    given = {"policy": family, "recipe": "small", "dataset": (dataset,), "out": out, "device": "cpu", "quiet": True}
+    train(PolicyTrainOptions(**given, steps=2, hold_out=1, hold_out_every=1, log_every=1, save_every=0))
+    with (out / "progress.csv").open() as file:
+        assert [bool(row["held_out_loss"]) for row in csv.DictReader(file)] == [True, True]
+    train(PolicyTrainOptions(resume=out, steps=3, device="cpu", quiet=True))
     folder = checkpoint_folder(out)
     facts = CheckpointFacts.read(folder)
     assert (facts.family, facts.recipe, facts.labels, facts.steps) == (family, "small", "v4", 3)
-    if family == "pi05":  # of a size that LeRobot has not
-        with checkpoint_encoders(folder):
-            policy, before, after = opened(folder)
-    else:
+    assert not [file for file in folder.glob("*.json") if ".part" in file.read_text()]
+    steps = json.loads((folder / "policy_preprocessor.json").read_text())["steps"]
+    assert all(Path(name).is_dir() for step in steps if (name := step["config"].get("tokenizer_name")))
+    # pi0.5 is of a size that LeRobot has not.
+    with checkpoint_encoders(folder) if family == "pi05" else contextlib.nullcontext():
         policy, before, after = opened(folder)
     assert all(bool(torch.isfinite(value).all()) for value in policy.state_dict().values() if value.is_floating_point())
     seen = before({"observation.state": torch.zeros(1, 64), "task": ["Open the door."]})

@@ -1,5 +1,6 @@
 """Recipes: the paper's table, LeRobot's own trainer reads and runs them, what the others change."""
 
+import functools
 import json
 import re
 import sys
@@ -31,6 +32,7 @@ seed 42, one observation."""
 ALL = [(family, name) for name, families in RECIPES.items() for family in families]
 
 
+@functools.cache
 def parsed(family):
     """The file as LeRobot's trainer reads it."""
     with draccus.config_type("json"):

@@ -8,8 +8,6 @@ import os
 import pkgutil
 import signal
 import socket
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -34,8 +32,9 @@ from arena_newton.trackers.train.terms.rewards import Term
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
 from arena_newton.trackers.twist2 import Twist2Tracker
+from tests.children import Child
 
-WORLDS = 8
+WORLDS, STEPS = 8, 2
 TWIST2 = interface.get("twist2")
 
 
@@ -49,7 +48,7 @@ def env(library):
 
 
 def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
-    options = TrainOptions(worlds=WORLDS, device="cpu", steps=8, print_interval=1000, **changes)
+    options = TrainOptions(**{"worlds": WORLDS, "device": "cpu", "steps": STEPS, "print_interval": 1000} | changes)
     card = Card(
         tracker="twist2",
         command="test",
@@ -64,6 +63,14 @@ def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
         physics=dataclasses.asdict(PhysicsRate(0.005, 4)),
     )
     return TrackerRunner(env, options, {"hidden": [64, 64]}, card, log_dir)
+
+
+@pytest.fixture(scope="module")
+def trained(env, tmp_path_factory):
+    """A runner that has learned two iterations."""
+    runner = make_runner(env, tmp_path_factory.mktemp("trained"), log_interval=1)
+    runner.learn(2)
+    return runner
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -165,8 +172,8 @@ def test_a_tick_keeps_its_buffers(env):
     assert [pointers(part, 0) for part in parts] == before
 
 
-def test_reward_improves(env):
-    """A few iterations of PPO move the policy to where a reward term wants it."""
+def test_reward_improves(env, monkeypatch):
+    """A few iterations of PPO move the policy to the action that a reward term wants, whatever the robot does."""
     torch.manual_seed(0)
     wanted = Term(lambda motion: (motion.action[:, 0] - 1.0).square(), -5.0)
     easy = TrackerEnv(
@@ -177,7 +184,8 @@ def test_reward_improves(env):
         "cpu",
         rewards={"wanted": wanted},
     )
-    runner = make_runner(easy, learning_rate=1e-3, desired_kl=10.0, entropy=0.0)
+    monkeypatch.setattr(easy.sim, "step", lambda: None)
+    runner = make_runner(easy, steps=8, learning_rate=1e-3, desired_kl=10.0, entropy=0.0)
     runner.alg.gamma = 0.0
     runner.learn(10)
     earned = [row["Train/reward_per_s"] for row in runner.history]
@@ -185,11 +193,9 @@ def test_reward_improves(env):
     assert runner.samples == 10 * 8 * WORLDS
 
 
-def test_resume_goes_on_as_before(env, tmp_path):
+def test_resume_goes_on_as_before(env, trained):
     """A checkpoint brings back networks, input statistics, sampling, learning rate and random numbers."""
-    first = make_runner(env, tmp_path / "a", minutes=0.0)
-    first.learn(2)
-    path = tmp_path / "a" / "model_last.pt"
+    first, path = trained, trained.folder / "model_last.pt"
     second = make_runner(env, None)
     state = torch.get_rng_state()
     second.load(str(path))
@@ -225,26 +231,23 @@ def test_old_checkpoints_are_deleted(env, tmp_path):
     assert files() == {"2", "3", "4", "last", "slim"}
 
 
-def test_export_is_what_was_trained(env, tmp_path):
+def test_export_is_what_was_trained(env, trained, tmp_path):
     """The weights file makes the actions of the trained actor, and its card says how it came to be."""
-    runner = make_runner(env, tmp_path)
-    runner.learn(1)
-    out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w" / "twist2.safetensors", note="A test."))
+    options = ExportOptions(tmp_path / "w" / "twist2.safetensors", note="A test.")
+    out = export(trained.folder / "model_last.pt", options)
     weights = weights_file.load(out, "twist2")
     observations = env.get_observations()
-    assert torch.equal(weights.network(observations["actor"]), runner.alg.actor(observations))
+    assert torch.equal(weights.network(observations["actor"]), trained.alg.actor(observations))
     assert weights.action_form == env.front_end.action_form and weights.drive == TWIST2_DRIVE
-    assert weights.card["samples"] == 8 * WORLDS and weights.card["licences"] == {"Apache-2.0": 2}
+    assert weights.card["samples"] == 2 * STEPS * WORLDS and weights.card["licences"] == {"Apache-2.0": 2}
     card = out.with_suffix(".md").read_text()
     assert "A test." in card and "| stand | 1 | 0.1 |" in card
 
 
-def test_exported_tracker_has_no_preferred_side(env, tmp_path):
+def test_exported_tracker_has_no_preferred_side(env, trained, tmp_path):
     """In a mirrored world the exported tracker gives the mirrored targets, though its network alone does not."""
-    runner = make_runner(env, tmp_path)
-    runner.learn(1)
     for symmetric in (True, False):
-        out = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
+        out = export(trained.folder / "model_last.pt", ExportOptions(tmp_path / "w.safetensors", symmetric=symmetric))
         tracker = Twist2Tracker.from_weights(out)
         mirror = env.front_end.mirror_obs(), env.front_end.mirror_action()
         seen = env.get_observations()["actor"]
@@ -255,11 +258,13 @@ def test_exported_tracker_has_no_preferred_side(env, tmp_path):
         assert ("mean of both ways" in out.with_suffix(".md").read_text()) == symmetric
 
 
-def test_export_takes_fitting_figures_only(env, tmp_path):
+def test_export_takes_fitting_figures_only(trained, tmp_path):
     """Figures of another tracker or no figures at all are refused, nothing is written then or overwritten."""
-    runner = make_runner(env, tmp_path)
-    runner.learn(1)
-    checkpoint, metrics, out = tmp_path / "model_last.pt", tmp_path / "evaluation.json", tmp_path / "w.safetensors"
+    checkpoint, metrics, out = (
+        trained.folder / "model_last.pt",
+        tmp_path / "evaluation.json",
+        tmp_path / "w.safetensors",
+    )
     figure = {"name": "falls", "bar": "no", "value": "0/8", "verdict": "pass"}
     document = {"options": {"engine": "mujoco", "rollouts": 8}, "trackers": [{"name": "sonic", "figures": [figure]}]}
     for text, words in (
@@ -302,22 +307,18 @@ def test_export_takes_fitting_figures_only(env, tmp_path):
         (lambda state: state.update(card=5), "not a checkpoint of this training"),
     ],
 )
-def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, tmp_path, change, words):
+def test_resume_refuses_what_is_no_checkpoint_of_this_training(env, trained, tmp_path, change, words):
     """Every difference that would change what is learnt is refused in words."""
-    runner = make_runner(env, tmp_path)
-    runner.save(str(tmp_path / "last.pt"))
-    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    state = torch.load(trained.folder / "model_last.pt", weights_only=True)
     change(state)
     torch.save(state, tmp_path / "other.pt")
     with pytest.raises(InputError, match=f"--resume .*other.pt: .*{words}"):
         make_runner(env).load(str(tmp_path / "other.pt"))
 
 
-def test_checkpoints_of_earlier_versions_are_taken(env, tmp_path):
+def test_checkpoints_of_earlier_versions_are_taken(env, trained, tmp_path):
     """The keys of a file's first version are enough to resume and to export."""
-    runner = make_runner(env, tmp_path)
-    runner.learn(1)
-    state = torch.load(tmp_path / "model_last.pt", weights_only=True)
+    state = torch.load(trained.folder / "model_last.pt", weights_only=True)
     first = (
         "actor_state_dict critic_state_dict optimizer_state_dict iter infos network norm_counts learning_rate samples"
     )
@@ -327,10 +328,10 @@ def test_checkpoints_of_earlier_versions_are_taken(env, tmp_path):
     torch.save({name: state[name] for name in kept}, tmp_path / "first.pt")
     resumed = make_runner(env)
     resumed.load(str(tmp_path / "first.pt"))
-    assert resumed.current_learning_iteration == 1 and resumed.samples == 8 * WORLDS
+    assert resumed.current_learning_iteration == 2 and resumed.samples == 2 * STEPS * WORLDS
     out = [
-        export(tmp_path / f"{name}.pt", ExportOptions(tmp_path / f"{name}.safetensors"))
-        for name in ("first", "model_last")
+        export(file, ExportOptions(tmp_path / f"{file.stem}.safetensors"))
+        for file in (tmp_path / "first.pt", trained.folder / "model_last.pt")
     ]
     assert out[0].read_bytes() == out[1].read_bytes()
 
@@ -354,11 +355,9 @@ def test_a_resumed_training_tells_of_all_its_parts(env, tmp_path, capsys):
     assert "other references" not in capsys.readouterr().out
 
 
-def test_other_references_start_without_evidence(env, tmp_path, capsys):
+def test_other_references_start_without_evidence(env, trained, tmp_path, capsys):
     """What was learnt about one library's clips says nothing about another's of the same shape."""
-    runner = make_runner(env, tmp_path)
-    runner.save(str(tmp_path / "last.pt"))
-    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    state = torch.load(trained.folder / "model_last.pt", weights_only=True)
     state["sampler"] |= {"library": "another", "seconds": state["sampler"]["seconds"] + 1e6}
     torch.save(state, tmp_path / "other.pt")
     make_runner(env).load(str(tmp_path / "other.pt"))
@@ -398,14 +397,14 @@ def test_a_second_interrupt_stops_at_once(env, monkeypatch):
         runner.learn(50)
 
 
-def test_export_overwrites_nothing_foreign_and_needs_every_tensor(env, tmp_path):
+def test_export_overwrites_nothing_foreign_and_needs_every_tensor(trained, tmp_path):
     """A card's neighbour of the same name stays; a checkpoint without a network is no tracker."""
-    make_runner(env).save(str(tmp_path / "last.pt"))
+    last = trained.folder / "model_last.pt"
     (tmp_path / "x.json").write_text("mine")
     with pytest.raises(InputError, match=r"--out .*x.safetensors: its card would overwrite .*x.json"):
-        export(tmp_path / "last.pt", ExportOptions(tmp_path / "x.safetensors"))
+        export(last, ExportOptions(tmp_path / "x.safetensors"))
     assert (tmp_path / "x.json").read_text() == "mine"
-    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    state = torch.load(last, weights_only=True)
     state["actor_state_dict"] = {}
     torch.save(state, tmp_path / "empty.pt")
     with pytest.raises(InputError, match="empty.pt: its network does not fit interface twist2"):
@@ -431,19 +430,15 @@ def test_the_end_of_a_time_limit_is_annealed(env):
     assert (runner.alg.desired_kl, runner.alg.entropy_coef) == pytest.approx((0.01, 0.005))
 
 
-SECOND_PROCESS = """
-import sys, torch, tyro
-from arena_newton.trackers.train import session
-from arena_newton.trackers.train.train_options import TrainOptions
-options = tyro.cli(TrainOptions, args=sys.argv[2:])
-runner = session.build(options)
-runner.learn(options.iterations)
-torch.save(runner.alg.get_policy().state_dict(), sys.argv[1])
-torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
-"""
+def second_process(arguments):
+    """Train, and save the network."""
+    options = tyro.cli(TrainOptions, args=arguments[1:])
+    runner = session.build(options)
+    runner.learn(options.iterations)
+    torch.save(runner.alg.get_policy().state_dict(), arguments[0])
+    torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
 
 
-@pytest.mark.release
 def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
     """As under torchrun on the CPU: both processes end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
@@ -452,17 +447,15 @@ def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
-    command = [sys.executable, "-c", SECOND_PROCESS, str(tmp_path / "second.pt"), *flags]
-    second = subprocess.Popen(
-        command, env=os.environ | group | {"RANK": "1", "LOCAL_RANK": "1"}, stderr=subprocess.PIPE
-    )
+    arguments = [str(tmp_path / "second.pt"), *flags]
+    second = Child(f"{__name__}:second_process", arguments, **group, RANK="1", LOCAL_RANK="1")
     for name, value in (group | {"RANK": "0", "LOCAL_RANK": "0"}).items():
         monkeypatch.setenv(name, value)
     precision = torch.get_float32_matmul_precision()
     try:
         runner = session.build(tyro.cli(TrainOptions, args=flags))
         runner.learn(1)
-        assert second.wait(300) == 0, second.stderr.read().decode()[-2000:]
+        assert second.wait(300) == 0, second.printed()[1][-2000:]
     finally:
         second.kill()
         torch.set_float32_matmul_precision(precision)
@@ -476,12 +469,10 @@ def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
     assert row["samples"] == 2 * 2 * 4
 
 
-def test_curves(env, tmp_path, capsys):
+def test_curves(trained, tmp_path, capsys):
     """A picture of one training or several; a folder without a log is named."""
-    runner = make_runner(env, tmp_path / "a", log_interval=1)
-    runner.learn(2)
-    out = tmp_path / "curves.png"
-    assert command_line.main(["curves", str(tmp_path / "a"), str(tmp_path / "a"), "--out", str(out)]) == 0
+    out, log = tmp_path / "curves.png", str(trained.folder)
+    assert command_line.main(["curves", log, log, "--out", str(out)]) == 0
     with Image.open(out) as picture:
         assert picture.width > 1000 and len(set(picture.convert("L").resize((60, 30)).getdata())) > 10
     (tmp_path / "bad.jsonl").write_text("3\n{}\n")
@@ -489,18 +480,16 @@ def test_curves(env, tmp_path, capsys):
         (["curves", str(tmp_path / "b")], "b/progress.jsonl: cannot be read"),
         (["curves"], "name the folders"),
         (["curves", str(tmp_path / "bad.jsonl")], "a logged iteration lacks seconds"),
-        (["curves", str(tmp_path / "a"), "--out", str(tmp_path / "a.txt")], "expected .png"),
+        (["curves", log, "--out", str(tmp_path / "a.txt")], "expected .png"),
     ):
         assert command_line.main(arguments) == 2
         assert words in capsys.readouterr().err
 
 
-def test_start_from_weights(env, tmp_path):
+def test_start_from_weights(env, trained, tmp_path):
     """A new training begins with the network of a weights file, and keeps it while the critic learns."""
-    first = make_runner(env, tmp_path)
-    first.learn(1)
-    file = export(tmp_path / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
-    weights = {k: v.clone() for k, v in first.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
+    file = export(trained.folder / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
+    weights = {k: v.clone() for k, v in trained.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
 
     second = make_runner(env)
     second.start_from(file)
