@@ -94,8 +94,7 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
 )
 def test_signals_name_a_stage(monkeypatch, stage, outcome, changes):
     """Each stage has its picture of signals, in tasks of other names by what their entries declare."""
-    further = dataclasses.replace(INTERACTIONS["boxing"], carried=True, reached_only=True)
-    monkeypatch.setitem(INTERACTIONS, "push_bin", further)
+    monkeypatch.setitem(INTERACTIONS, "push_bin", dataclasses.replace(INTERACTIONS["vis_navi"], carried=True))
     assert stage_of(judged(outcome, **changes)) == stage
 
 
