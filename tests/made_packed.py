@@ -1,9 +1,10 @@
 """A packed policy with random weights, made without LeRobot."""
 
+import functools
 import json
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save, save_file
 
 from arena_newton.policies.learned.act_network import ActNetwork, ActSizes
 from arena_newton.policies.learned.learned_card import PolicyCard
@@ -12,6 +13,16 @@ from arena_newton.policies.train.checkpoint_packing import pack
 
 WIDTH = 16
 CHUNK = 5
+SMALL = {"dim_model": WIDTH, "n_heads": 2, "dim_feedforward": WIDTH, "n_encoder_layers": 1, "latent_dim": 4}
+
+
+@functools.cache
+def _weights(tasks):
+    """Content of a file of random weights for so many tasks."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(3)
+        network = ActNetwork(ActSizes(state=64, tasks=tasks, actions=40, chunk_size=CHUNK, **SMALL))
+    return save({f"model.{name}": value.contiguous() for name, value in network.state_dict().items()})
 
 
 def checkpoint(folder, tasks=("boxing", "vis_navi"), *, size=(48, 64), trackers=("twist2",), **said):
@@ -19,12 +30,7 @@ def checkpoint(folder, tasks=("boxing", "vis_navi"), *, size=(48, 64), trackers=
     folder.mkdir(parents=True)
     facts = {"width": size[1], "height": size[0], "labels": "v4", "family": "act", "recipe": "compact"} | said
     CheckpointFacts(task_vector=tasks, tasks=tasks, trackers=trackers, **facts).write(folder)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(3)
-        small = {"dim_model": WIDTH, "n_heads": 2, "dim_feedforward": WIDTH, "n_encoder_layers": 1, "latent_dim": 4}
-        network = ActNetwork(ActSizes(state=64, tasks=len(tasks), actions=40, chunk_size=CHUNK, **small))
-    weights = {f"model.{name}": value.contiguous() for name, value in network.state_dict().items()}
-    save_file(weights, folder / "model.safetensors")
+    (folder / "model.safetensors").write_bytes(_weights(len(tasks)))
     shapes = {
         "observation.images.front": ("VISUAL", [3, *size]),
         "observation.state": ("STATE", [64]),
@@ -32,7 +38,7 @@ def checkpoint(folder, tasks=("boxing", "vis_navi"), *, size=(48, 64), trackers=
     }
     config = {"type": "act", "n_obs_steps": 1, "chunk_size": CHUNK, "n_action_steps": CHUNK, "n_decoder_layers": 1}
     config |= {"vision_backbone": "resnet18", "replace_final_stride_with_dilation": False, "use_vae": False}
-    config |= {"pre_norm": False, "feedforward_activation": "relu", "temporal_ensemble_coeff": None} | small
+    config |= {"pre_norm": False, "feedforward_activation": "relu", "temporal_ensemble_coeff": None} | SMALL
     config["input_features"] = {name: {"type": kind, "shape": shape} for name, (kind, shape) in shapes.items()}
     config["output_features"] = {"action": {"type": "ACTION", "shape": [40]}}
     (folder / "config.json").write_text(json.dumps(config))

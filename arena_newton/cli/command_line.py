@@ -28,6 +28,8 @@ LIBRARIES = {
     "mujoco": "Warp, Newton and MuJoCo",
     "pxr": "USD",
     "matplotlib": "matplotlib",
+    "scipy": "SciPy",
+    "pyarrow": "pyarrow",
 }
 """Package that takes seconds to import → what the command line says that it loads."""
 QUIET = frozenset({"-h", "--help", "--json"})

@@ -1,11 +1,13 @@
 """Engine and device of a run, chosen while it is planned: Warp is loaded only where a GPU is looked for."""
 
+import itertools
+import os
 from pathlib import Path
 
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
 
-__all__ = ["cluster_engine", "resolve_engine"]
+__all__ = ["cluster_engine", "resolve_engine", "visible_gpus"]
 
 NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
@@ -59,10 +61,14 @@ def cluster_engine(engine: str, device: str | None, gpus: float | None) -> tuple
         raise InputError(f"{given}: engine mujoco runs on the CPU, use --engine warp for CUDA")
     if device == "cpu" and gpus:
         raise InputError(f"--ray-gpus {gpus:g}: contradicts --device cpu")
-    if cuda or gpus or (device is None and (engine == "warp" or (engine == "auto" and _has_gpu()))):
+    if cuda or gpus or (device is None and (engine == "warp" or (engine == "auto" and visible_gpus()))):
         return "warp", "cuda:0"
     return ("warp" if engine == "warp" else "mujoco"), "cpu"
 
 
-def _has_gpu() -> bool:
-    return NVIDIA_DEVICES.is_dir() and any(NVIDIA_DEVICES.iterdir())
+def visible_gpus() -> list[str]:
+    """GPUs of this machine that this process may use, as `CUDA_VISIBLE_DEVICES` names them; Warp is not loaded."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return list(itertools.takewhile(lambda name: name not in ("", "-1"), map(str.strip, named.split(","))))
+    return [str(number) for number, _ in enumerate(NVIDIA_DEVICES.iterdir())] if NVIDIA_DEVICES.is_dir() else []

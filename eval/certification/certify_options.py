@@ -5,22 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arena_newton.cli.flags import Several
+from arena_newton.eval.plan.options import Jobs
 
 __all__ = ["CertifyOptions"]
 
 
 @dataclass(frozen=True)
-class CertifyOptions:
+class CertifyOptions(Jobs):
     """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
 
     The tasks' experts play in all checks but policy-inputs, execution, physics, camera and statistics. Exit code 0: no
-    check fails; 1: one fails; 2: bad input.
+    check fails; 1: one fails; 2: bad input. --jobs 0 only plays and writes no page, as each of several processes does.
     """
 
     out: str = "results/certify"
     """Folder of the certificate and of the evaluations behind it."""
     quick: bool = False
-    """A few episodes of everything by two processes: minutes instead of hours, and wide intervals."""
+    """A few episodes of everything by two processes, or --jobs: minutes instead of hours, and wide intervals."""
     task: Several[str] = ()
     """Tasks; all that have an expert when none is named."""
     tracker: Several[str] = ("twist2", "sonic")
@@ -39,8 +40,5 @@ class CertifyOptions:
     """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
-    jobs: int = 1
-    """Processes that play at once, each on cores of its own, 2 under --quick (0: only play and write no page, as each
-    of them does)."""
     resume: bool = False
     """Continue a certification in its folder; what was played is kept."""

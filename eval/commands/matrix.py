@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.eval.commands.run import before_ray
 from arena_newton.eval.suites.suite_options import MatrixOptions
 
 if TYPE_CHECKING:
@@ -25,11 +24,10 @@ def run(files: Sequence[Path], options: MatrixOptions, factories: Factories | No
         if call.problem is not None:
             raise call.problem
         return 0
-    if options.ray is not None:
-        before_ray()
-        from arena_newton.eval.suites import ray_suite
+    if options.dealt:
+        from arena_newton.eval.suites import dealt_suite
 
-        return ray_suite.run(call, factories)
+        return dealt_suite.run(call, factories)
     from arena_newton.eval.suites import suite_run
 
     return suite_run.run(call, factories)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 from arena_newton.eval.plan.options import RunOptions
@@ -10,7 +9,7 @@ from arena_newton.eval.plan.options import RunOptions
 if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
 
-__all__ = ["before_ray", "run"]
+__all__ = ["run"]
 
 
 def run(options: RunOptions, factories: Factories | None = None) -> int:
@@ -28,16 +27,10 @@ def run(options: RunOptions, factories: Factories | None = None) -> int:
     if row is not None:
         beside = ResultsFolder(results_folder(row.out), resolve(row), versions())
         beside.check()
-    if config.flags.ray is not None:
-        before_ray()
-        from arena_newton.eval.workers import ray_run
+    if config.flags.dealt:
+        from arena_newton.eval.workers import dealing
 
-        return ray_run.execute(folder, factories, beside)
+        return dealing.execute(folder, factories, beside)
     from arena_newton.eval.play.run import execute
 
     return execute(folder, factories, beside)
-
-
-def before_ray() -> None:
-    """Set what is read when ray is imported: under `uv run` it would start every process by another `uv run`."""
-    os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"

@@ -27,10 +27,10 @@ from arena_newton.eval.plan.options import (
     QUICK_SEEDS,
     QUICK_TRACKERS,
     Chunks,
-    Ray,
     RecordOptions,
     RunOptions,
     Viewer,
+    Workers,
     flags_of,
     is_quick,
 )
@@ -76,7 +76,7 @@ MOST_EPISODES = 200
 MOST_DISTURBANCE = 10.0
 """Largest factor of the noise; no robot stands far less."""
 ONE_CALL = frozenset("accept_versions retry_errors skip_broken verbose".split())
-ONE_CALL |= {*flags_of(Viewer), *flags_of(Ray)}
+ONE_CALL |= {*flags_of(Viewer), *flags_of(Workers)}
 """Flags that a resumed run does not take over."""
 
 
@@ -349,10 +349,10 @@ def resolve(options: RunOptions) -> RunConfig:
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
     variant_hash = layers_hash(variant) if variant else None
-    if options.ray is None:
-        engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
-    else:
+    if options.dealt:
         engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
+    else:
+        engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(
         flags=dataclasses.replace(flags, engine=engine, device=device, shard=None if shard is None else str(shard)),
         episodes=tuple(dataclasses.replace(episode, engine=engine) for episode in played),

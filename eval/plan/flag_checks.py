@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from arena_newton.cli.extras import require
 from arena_newton.cli.flags import check_least, flag_name
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.options import Ray, Recording, Remote, RunOptions, Viewer, flags_of, is_quick
+from arena_newton.eval.plan.options import Ray, Recording, Remote, RunOptions, Viewer, Workers, flags_of, is_quick
 from arena_newton.eval.records.sharding import parse_shard
 from arena_newton.files.text import plain_text, unprintable
 from arena_newton.pictures.settings import MOST_PORT, VIEWERS
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 
-__all__ = ["DRIVES", "LABELS", "check_flags", "check_ray", "check_width"]
+__all__ = ["DRIVES", "LABELS", "check_flags", "check_width", "check_workers"]
 
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
@@ -24,6 +24,8 @@ DRIVES: Mapping[str, DriveGains | None] = {
     "humanoidarena": TWIST2_HUMANOIDARENA_DRIVE,
 }
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
+MOST_JOBS = 256
+"""Processes of one machine that play."""
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.readers.label_protocols.LABELS`, which loads torch."""
 
@@ -52,7 +54,7 @@ def check_flags(options: RunOptions) -> None:
     _check_belonging(options, Recording, "--record", options.record)
     _check_policy(options)
     _check_viewer(options)
-    check_ray(options)
+    check_workers(options)
     check_width(options)
     if "all" in options.task and len(options.task) > 1:
         raise InputError("--task all: must be alone, name either all or single tasks")
@@ -139,15 +141,24 @@ def check_width(options: RunOptions) -> None:
         raise InputError("--shard: does not go with --until-width, whose episodes follow from the earlier ones")
 
 
-def check_ray(options: Ray) -> None:
-    """Refuse a cluster that cannot be asked for, before one is looked for.
+def check_workers(options: Workers) -> None:
+    """Refuse processes that cannot be asked for, before any is started or a cluster is looked for.
 
     Raises:
         InputError: A number is out of range, a flag does not go with it, or the extra is missing.
     """
     _check_belonging(options, Ray, "--ray", options.ray is not None)
+    if not 1 <= options.jobs <= MOST_JOBS:
+        raise InputError(f"--jobs {options.jobs}: expected 1 to {MOST_JOBS}")
+    if options.dealt and getattr(options, "viewer", None) is not None:
+        raise InputError("--viewer: shows worlds of this process, and with --ray or --jobs none are; drop one of both")
+    device = getattr(options, "device", None) or ""
+    if options.jobs > 1 and re.fullmatch(r"cuda:0*[1-9]\d*", device):
+        raise InputError(f"--device {device}: --jobs takes all GPUs in turn; choose some by CUDA_VISIBLE_DEVICES")
     if options.ray is None:
         return
+    if options.jobs > 1:
+        raise InputError(f"--jobs {options.jobs}: are processes of this machine, not of --ray; drop one of both")
     addresses = [text for text in options.ray if text == "auto" or re.fullmatch(r"[^/\s]+:[0-9]{1,5}", text)]
     if len(options.ray) > 1 or len(addresses) < len(options.ray):
         raise InputError(f"--ray {' '.join(options.ray)}: expected one address, such as 10.0.0.1:6379, auto, or none")
@@ -157,6 +168,4 @@ def check_ray(options: Ray) -> None:
         raise InputError(f"--ray-gpus {gpus:g}: expected more than 0 and at most 1; an environment is on one GPU")
     if not 0 < minutes < math.inf:
         raise InputError(f"--ray-minutes {minutes:g}: expected more than 0, and finite")
-    if getattr(options, "viewer", None) is not None:
-        raise InputError("--viewer: shows worlds of this process, and with --ray none are; drop one of both")
     require("ray", "--ray")

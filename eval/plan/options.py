@@ -21,13 +21,15 @@ __all__ = [
     "Batch",
     "Chunks",
     "Conditions",
-    "Stepping",
+    "Jobs",
     "Ray",
     "RecordOptions",
     "Recording",
     "Remote",
     "RunOptions",
+    "Stepping",
     "Viewer",
+    "Workers",
     "flags_of",
     "is_quick",
 ]
@@ -178,6 +180,24 @@ class Ray:
 
 
 @dataclass(frozen=True)
+class Jobs:
+    """Processes of this machine."""
+
+    jobs: int = 1
+    """Processes of this machine that play at once, each on cores of its own; they take its GPUs in turn."""
+
+
+@dataclass(frozen=True)
+class Workers(Ray, Jobs):
+    """Other processes that play."""
+
+    @property
+    def dealt(self) -> bool:
+        """True if this process deals episodes out to others and plays none."""
+        return self.ray is not None or self.jobs > 1
+
+
+@dataclass(frozen=True)
 class Output:
     """Part of the plan, folder and what is printed."""
 
@@ -220,7 +240,9 @@ class _Plan:
 
 
 @dataclass(frozen=True)
-class RunOptions(Remote, Output, Ray, Viewer, Recording, Pictures, Stepping, Batch, _Plan, Conditions, Chunks, Tested):
+class RunOptions(
+    Remote, Output, Workers, Viewer, Recording, Pictures, Stepping, Batch, _Plan, Conditions, Chunks, Tested
+):
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
     Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
@@ -284,7 +306,7 @@ class _Demonstrations:
 
 
 @dataclass(frozen=True)
-class RecordOptions(Output, Ray, Stepping, Batch, _Demonstrations, Conditions, Tested):
+class RecordOptions(Output, Workers, Stepping, Batch, _Demonstrations, Conditions, Tested):
     """Record demonstrations: episodes as files, of which `python -m arena_newton.data build` makes a dataset.
 
     Seeds are of a range of their own, which no evaluation plays. `python -m arena_newton.eval resume <out>` continues.

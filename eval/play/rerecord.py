@@ -36,7 +36,7 @@ from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import EPISODES, SUBFOLDERS, setting
 from arena_newton.eval.plan.config import RunConfig, plain_facts, recorded_cameras, resolve
 from arena_newton.eval.plan.flag_checks import DRIVES
-from arena_newton.eval.plan.options import Ray, RecordOptions, RunOptions, flags_of
+from arena_newton.eval.plan.options import RecordOptions, RunOptions, Workers, flags_of
 from arena_newton.eval.play import recording
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.records.identity import differing_key
@@ -122,9 +122,9 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
     recorded = (
         "task tracker mode policy rules episodes only_success disturb disturb_scale seed_series max_steps drive shard"
     )
-    for name in (*recorded.split(), *flags_of(Ray)):
+    for name in (*recorded.split(), *flags_of(Workers)):
         if getattr(options, name) != getattr(RecordOptions, name):
-            why = "plays a plan" if name.startswith("ray") else "is in the recording"
+            why = "plays a plan" if name in flags_of(Workers) else "is in the recording"
             raise InputError(f"{flag_name(name)}: {why}; drop it beside --from")
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")

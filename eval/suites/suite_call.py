@@ -11,7 +11,7 @@ from pathlib import Path
 
 from arena_newton.cli.flags import check_least, shell_command, words
 from arena_newton.errors import InputError
-from arena_newton.eval.plan.flag_checks import check_ray
+from arena_newton.eval.plan.flag_checks import check_workers
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.sharding import parse_shard
 from arena_newton.eval.suites.matrix_cells import (
@@ -66,7 +66,7 @@ def plan_call(given: str, options: MatrixOptions) -> SuiteCall:
     suite = read_suite_file(suite_path(given))
     only, shard = parse_only(options.only), parse_shard(options.shard)
     options = dataclasses.replace(options, shard=str(shard))
-    check_ray(options)
+    check_workers(options)
     check_least(options, 1, "limit")
     cells = expand_cells(suite)
     if shard.count > max(len(cells), 1):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from arena_newton.eval.plan.options import Ray
+from arena_newton.eval.plan.options import Workers
 
 __all__ = ["MatrixOptions"]
 
@@ -40,7 +40,7 @@ class _Cells:
 
 
 @dataclass(frozen=True)
-class MatrixOptions(Ray, _Cells):
+class MatrixOptions(Workers, _Cells):
     """Play every cell of a suite: policies x trackers x tasks x modes x rules, as one plan that can be continued.
 
     SUITE is a TOML file, or the name of one that comes with the package (paper, tiny). All cells are checked before the

@@ -15,7 +15,7 @@ from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
 from arena_newton.eval.plan.config import RunConfig, resolve
-from arena_newton.eval.plan.options import Ray, flags_of
+from arena_newton.eval.plan.options import Workers, flags_of
 from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunStopped, execute
 from arena_newton.eval.records.document import SUITE_FILE
@@ -112,7 +112,7 @@ class CellPlayer:
         for name in chosen:
             cell = self.folder.plan.cell(name)
             options = run_options(self.suite, cell, self.folder.path, self.options.device)
-            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", *flags_of(Ray))}
+            given = {flag: getattr(self.options, flag) for flag in ("retry_errors", *flags_of(Workers))}
             try:
                 self.configs[name] = resolve(dataclasses.replace(options, **given))
             except InputError as error:

@@ -22,9 +22,10 @@ from arena_newton.eval.statistics.trainings import (
 )
 from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import FAMILIES, TRAINING_SETS, PaperNumbers
-from arena_newton.eval.tables.table_entries import PAPER_NAMES, SEMANTIC_STRENGTH, semantic_text
+from arena_newton.eval.tables.table_entries import PAPER_NAMES
 from arena_newton.files.text import counted
 from arena_newton.pages.tables import points
+from arena_newton.tasks.semantic_mode import semantic_note
 
 __all__ = ["NEGLIGIBLE", "SIGNIFICANT", "ClaimResult", "findings"]
 
@@ -451,7 +452,7 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
         if kept and "semantic" in weights:
             said += f". Semantic mode costs, by what it changes: {_by_change(chosen(('base', 'semantic'), every))}"
         paper_said = f"{points(theirs(weights, every))} points"
-        remark = f"{semantic_text()} {SEMANTIC_STRENGTH}" if "semantic" in weights else ""
+        remark = semantic_note() if "semantic" in weights else ""
         found.append(_result(f"perturbation: {name}", claim, paper_said, said, _greater(result), remark))
     drop = compared[0][2]
     halves = [chosen(drop, suites()[suite]) for suite in HALVES]

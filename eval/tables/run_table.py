@@ -18,10 +18,11 @@ from arena_newton.eval.tables.episode_table import (
     error_note,
     incomplete_note,
 )
-from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, ordered, semantic_text
+from arena_newton.eval.tables.table_entries import ordered
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between
 from arena_newton.rules.rule_types import MODES
+from arena_newton.tasks.semantic_mode import semantic_note
 
 __all__ = ["joint_table"]
 
@@ -110,7 +111,7 @@ def _notes(runs: Sequence[RunRecord], cells: Sequence[EvaluatedCell]) -> list[st
             due = f"{len(run.records)} of {counted(due_episodes(run.document), 'episode')}"
             found.append(f"{run.folder} is shard {shard} of a plan of {run.document['planned']:,} episodes: {due}.")
     if any(cell.mode == "semantic" for cell in cells):
-        found.append(f"{semantic_text()} {SEMANTIC_STRENGTH}")
+        found.append(semantic_note())
     falls = [held for cell in cells for held in cell.held("fall").values()]
     found += [f"{counted(sum(falls), 'episode')} of {len(falls)} ended in a fall."] if any(falls) else []
     return [*found, *filter(None, [error_note(cells)]), *code_notes(runs)]

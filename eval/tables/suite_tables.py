@@ -24,7 +24,6 @@ from arena_newton.eval.tables.paper_numbers import (
 )
 from arena_newton.eval.tables.table_entries import (
     PAPER_NAMES,
-    SEMANTIC_STRENGTH,
     UNDEFINED,
     SuiteTable,
     TableEntry,
@@ -36,11 +35,10 @@ from arena_newton.eval.tables.table_entries import (
     probability,
     published_entry,
     rate_text,
-    semantic_text,
-    task_title,
 )
 from arena_newton.eval.tables.trainings_table import trainings_table
 from arena_newton.pages.tables import percent, points
+from arena_newton.tasks.semantic_mode import semantic_note, task_title
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
@@ -207,7 +205,7 @@ def _change(mode: str, task: str) -> str:
 
 def _about(*modes: str) -> str:
     """Sentences for a reader of numbers of semantic mode."""
-    return f" {semantic_text()} {SEMANTIC_STRENGTH}" if "semantic" in modes else ""
+    return f" {semantic_note()}" if "semantic" in modes else ""
 
 
 def _reported(paper: PaperNumbers) -> str:

@@ -7,8 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from arena_newton import tasks
-from arena_newton.eval.statistics.stats import Contrast, contrast, population_std, seed_rates, suites, wilson
+from arena_newton.eval.statistics.stats import Contrast, contrast, population_std, seed_rates, wilson
 from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import PaperRate, PublishedRow
 from arena_newton.pages.tables import Table, percent
@@ -16,8 +15,6 @@ from arena_newton.pages.tables import Table, percent
 __all__ = [
     "NO_RESULT",
     "PAPER_NAMES",
-    "SEMANTIC_CHANGES",
-    "SEMANTIC_STRENGTH",
     "UNDEFINED",
     "SuiteTable",
     "TableEntry",
@@ -29,23 +26,10 @@ __all__ = [
     "published_entry",
     "probability",
     "rate_text",
-    "semantic_text",
-    "task_title",
 ]
 
 PAPER_NAMES = {"act": "ACT", "diffusion": "DP", "flow": "FM", "pi05": "π0.5"}
 """Family → how the paper's tables name it."""
-SEMANTIC_STRENGTH = (
-    "How strong these shifts are was chosen here (bricks, wood, a blue sofa; the original's files were not at hand): "
-    "how much a policy loses cannot be compared with the paper, only the direction."
-)
-"""Sentence of every table of numbers of semantic mode."""
-SEMANTIC_CHANGES = {
-    "texture": "textures and colours in",
-    "shape": "the shape of a target that is drawn without a collider in",
-    "clutter": "things that are added in",
-}
-"""Change that semantic mode makes → words for it."""
 NO_RESULT = "no result"
 """Source of numbers of cut step budgets or another scene in a `cells.csv`, of which no finding is made."""
 UNDEFINED = "—"
@@ -111,23 +95,6 @@ class SuiteTable(Table):
 def ordered(names: set[str], known: Sequence[str]) -> list[str]:
     """Names in the order of those that are known, others after them."""
     return [name for name in known if name in names] + sorted(names - set(known))
-
-
-def task_title(task: str) -> str:
-    """A task as the paper's tables name it, such as `DoubleDesk`."""
-    return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
-
-
-def semantic_text() -> str:
-    """Sentence that names what semantic mode changes in which of the paper's tasks."""
-    parts = []
-    for change, words in SEMANTIC_CHANGES.items():
-        named = [task_title(name) for name in suites()["ALL_AVG"] if tasks.get(name).semantic_change == change]
-        parts += [f"{words} {', '.join(named)}"] if named else []
-    return (
-        f"Semantic mode changes looks, and nothing that moves or collides in base mode: {'; '.join(parts)}. (Under "
-        "rules released what counts in VisNavi becomes a disc, too, and Football has a second ball.)"
-    )
 
 
 def interval_text(low: float, high: float) -> str:

@@ -6,8 +6,9 @@ import statistics
 from collections.abc import Sequence
 
 from arena_newton.eval.tables.episode_table import EvaluatedCell
-from arena_newton.eval.tables.table_entries import SuiteTable, task_title
+from arena_newton.eval.tables.table_entries import SuiteTable
 from arena_newton.pages.tables import percent
+from arena_newton.tasks.semantic_mode import task_title
 
 __all__ = ["trainings_table"]
 

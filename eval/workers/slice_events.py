@@ -1,4 +1,4 @@
-"""Messages between the processes of a cluster and the run that they play for: small values, never pictures."""
+"""Messages between processes and the run that they play for: small values, never pictures."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Broke", "Built", "Ended", "Event", "Node", "Opened", "Slice", "Ticks", "broke"]
+__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "Slice", "Ticks", "broke"]
 
 
 @dataclass(frozen=True)
 class Node:
-    """Location of a process in the cluster."""
+    """Location of a process."""
 
     name: str
-    """Ray's name of the node."""
+    """Ray's name of the node; empty on this machine."""
     host: str
     pid: int
     gpus: str = ""
@@ -75,6 +75,11 @@ class Ended:
 
     line: JsonObject
     """Its line of the journal."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """The process of a slice has reported all that it played, and waits."""
 
 
 @dataclass(frozen=True)

@@ -160,6 +160,7 @@ def test_a_home_that_is_nobodys_is_bad_input(capsys):
         ("arena_newton.trackers.evaluate --tracker twist2", "warp", "Warp, Newton and MuJoCo"),
         ("arena_newton trackers motions inspect nothing.npz", "torch", "torch"),
         ("arena_newton scenes validate football", "pxr", "USD"),
+        ("arena_newton.eval certify --quick", "scipy", "SciPy"),
     ],
 )
 def test_a_command_says_what_it_loads_before_it_does(command, library, title, tmp_path):
@@ -173,9 +174,11 @@ def test_a_command_says_what_it_loads_before_it_does(command, library, title, tm
     assert done.stderr.splitlines() == ([] if title is None else [f"loading {title} ..."]) + ["it runs"]
 
 
-def test_text_that_a_stream_lacks_is_no_crash():
-    """On a stream of another character set a command prints `?` for what that lacks, and its whole answer."""
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+@pytest.mark.parametrize("given", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}])
+def test_text_that_a_stream_lacks_is_no_crash(given):
+    """On a stream of another character set a command without a home prints its whole answer, with `?` for the rest."""
+    environment = {name: value for name, value in os.environ.items() if name != "HOME"} | given
+    environment["PYTHONCOERCECLOCALE"] = "0"
     command = [sys.executable, "-m", "arena_newton", "rules"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert (done.returncode, done.stderr) == (0, "") and "?" in done.stdout and len(done.stdout.splitlines()) > 50

@@ -137,9 +137,13 @@ def fake_tracker(spec, checkpoint):
     return SimpleNamespace(name=spec, describe=lambda: {"name": spec, "drive": "none"})
 
 
+def any_variant(path, task):
+    """Every file is a scene."""
+
+
 def factories(**changes):
     """Builders of the stand-ins."""
-    parts = {"env": FakeEnv, "tracker": fake_tracker, "policy": FakePolicy, "check_variant": lambda path, task: None}
+    parts = {"env": FakeEnv, "tracker": fake_tracker, "policy": FakePolicy, "check_variant": any_variant}
     return Factories(**(parts | changes))
 
 

@@ -72,7 +72,7 @@ def actors(pid):
     found = []
     for process in descendants(pid):
         try:
-            if process.name().startswith("ray::Episode"):
+            if process.name().startswith("ray::RayActor"):
                 found.append(process.pid)
         except psutil.Error:
             continue

@@ -107,7 +107,10 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
     assert swapped["all", "twist2", "sonic"] == ["8/8", "0/8", "0 % to 32 %", "", "-100", "0 %"]
     assert f"twist2 to sonic keeps 0 % (p = {mcnemar(8, 0):.2g})" in checks["swap"]["summary"]
     for name in ("certify.html", "certify.md"):
-        assert "gliding-base" in (tmp_path / "o" / name).read_text()
+        page = (tmp_path / "o" / name).read_text()
+        assert "gliding-base" in page and "privileged: they read the world itself" in page
+    journal = tmp_path / "o" / "runs" / "boxing" / "twist2_paper_base" / "episodes.jsonl"
+    assert json.loads(journal.read_text().splitlines()[0])["privileged"] is True
 
 
 @pytest.mark.parametrize(

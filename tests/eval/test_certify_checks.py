@@ -214,7 +214,8 @@ class Played:
 
     def __init__(self, **outcomes):
         self.outcomes, self.tasks, self.trackers = outcomes, ("boxing",), ("twist2",)
-        self.options = SimpleNamespace(engine="mujoco", device=None, checks=("engines",), twist2_checkpoint="official")
+        given = {"device": None, "checks": ("engines",), "twist2_checkpoint": "official", "quick": False, "jobs": 1}
+        self.options = SimpleNamespace(engine="mujoco", **given)
 
     def evaluate(self, cell):
         which = "other" if cell.engine == "warp" or cell.checkpoint == "official" else "own"
@@ -261,7 +262,7 @@ def test_engines_that_step_other_models_differ_at_once(tmp_path, monkeypatch):
     found = {"unlike": ["body_mass"], "gaps": [1e-7, 2e-5, 1e-4, 1e-3, 1e-2]}
     monkeypatch.setattr(agreement, "first_ticks", lambda *given: found)
     monkeypatch.setattr(agreement, "resolve_engine", lambda *given: ("warp", "cpu"))
-    options = SimpleNamespace(engine="mujoco", device=None, checks=())
+    options = SimpleNamespace(engine="mujoco", device=None, checks=(), quick=False, jobs=1)
     measured = lambda name, task, tracker, settings, measure: measure()  # noqa: E731
     context = SimpleNamespace(options=options, tasks=("boxing",), trackers=("twist2",), measured=measured)
     said = agreement.engines(context)
@@ -271,11 +272,11 @@ def test_engines_that_step_other_models_differ_at_once(tmp_path, monkeypatch):
     )
 
 
-def test_a_tiny_real_certification(tmp_path, capsys):
+def test_a_tiny_real_certification(tmp_path, kept_worlds):
     """One task and tracker, one episode: the expert solves it, frozen legs do not, and the strips are on the page."""
     flags = {"task": ("boxing",), "tracker": ("twist2",), "episodes": 1, "quick": True, "worlds": 1}
     options = CertifyOptions(out=str(tmp_path), checks=("gliding-base",), **flags)
-    assert certify.run(options) == 0
+    assert certify.run(options, Factories(env=kept_worlds)) == 0
     page = (tmp_path / "certify.html").read_text()
     assert "success at step" in page and "data:image/jpeg;base64," in page
     assert (tmp_path / "runs" / "boxing" / "twist2_paper_base_gliding" / "episodes.jsonl").is_file()

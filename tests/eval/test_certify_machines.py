@@ -169,7 +169,7 @@ def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(machines, "POLL", 0.05)
     (tmp_path / "episodes.jsonl").write_text("")
     waits = "import time; time.sleep(60)"
-    idle, plays = (f'(exec -a ray::EpisodeActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
+    idle, plays = (f'(exec -a ray::RayActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
     run = subprocess.Popen(["bash", "-c", f"{idle} & other=$!; {plays}; touch {tmp_path}/gone; kill $other"])
     try:
         wait_for(lambda: machines._actors(run.pid))

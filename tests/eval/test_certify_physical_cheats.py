@@ -6,13 +6,13 @@
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import closed_forms
-from arena_newton.eval.play.run import Factories
 from arena_newton.kernels.rules import success
 from arena_newton.physics import batch, scene
 from arena_newton.pictures.camera import Camera
@@ -21,23 +21,29 @@ FORMS = ("fall", "weight", "masses", "soles", "bounces", "drives")
 """Closed forms of the check `physics`."""
 
 
-@pytest.fixture
-def certified(tmp_path, kept_worlds):
+def certified(folder, check, task):
     """Exit code of a check of one task through TWIST2; engines that are not named compare their first ticks alone."""
+    options = CertifyOptions(out=str(folder), task=(task,), tracker=("twist2",), episodes=1, quick=True)
+    return certify.run(options, checks=[one for one in certify.CHECKS if one.name == check])
 
-    def code(check, task):
-        options = CertifyOptions(out=str(tmp_path), task=(task,), tracker=("twist2",), episodes=1, quick=True)
-        own = Factories() if task == "football" else Factories(env=kept_worlds)  # its models are compiled otherwise
-        return certify.run(options, own, checks=[one for one in certify.CHECKS if one.name == check])
 
-    return code
+PLAN = closed_forms._plan
+
+
+@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_both_engines_are_measured(engine, quick):
+    """Closed forms are measured in every task on the episodes' engine, and at least in the first on the other one."""
+    given = SimpleNamespace(options=SimpleNamespace(quick=quick), tasks=("football", "boxing"), trackers=("twist2",))
+    found = [(row[0], row[2]) for row in PLAN(given, (engine, "cpu")) if row[4]]
+    assert {(engine, "football"), (engine, "boxing")} < set(found)
+    assert ({"mujoco": "warp", "warp": "mujoco"}[engine], "football") in found
 
 
 @pytest.fixture(autouse=True)
 def one_engine(monkeypatch):
     """Closed forms on engine mujoco alone: Warp's CPU backend takes half a minute."""
-    plan = closed_forms._plan
-    monkeypatch.setattr(closed_forms, "_plan", lambda *given: [one for one in plan(*given) if one[0] == "mujoco"])
+    monkeypatch.setattr(closed_forms, "_plan", lambda *given: [one for one in PLAN(*given) if one[0] == "mujoco"])
 
 
 def compiled(monkeypatch, change):
@@ -133,17 +139,17 @@ def test_the_page_lists_every_cheat():
 
 
 @pytest.mark.parametrize(("check", "task"), sorted({row[:2] for row in CHEATS}))
-def test_the_honest_pass(certified, check, task):
+def test_the_honest_pass(tmp_path, check, task):
     """Without a patch every check that finds a cheat passes."""
-    assert certified(check, task) == 0
+    assert certified(tmp_path, check, task) == 0
 
 
 @pytest.mark.parametrize(("check", "task", "cheat", "form"), CHEATS, ids=lambda given: getattr(given, "__name__", None))
-def test_a_cheat_is_found_by_name(certified, monkeypatch, capsys, check, task, cheat, form):
+def test_a_cheat_is_found_by_name(tmp_path, monkeypatch, capsys, check, task, cheat, form):
     """`certify --quick` fails, and its line names the check."""
     cheat(monkeypatch)
     for name in FORMS:
         if name != form:
             monkeypatch.setattr(closed_forms, name, lambda bench, **_: ())
-    assert certified(check, task) == 1
+    assert certified(tmp_path, check, task) == 1
     assert re.search(rf"^fail  {check} ", capsys.readouterr().out, re.MULTILINE)

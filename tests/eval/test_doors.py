@@ -199,12 +199,9 @@ def test_a_picture_of_no_size_is_named(tmp_path, monkeypatch):
 
 
 def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch, tmp_path, kept_worlds):
-    """No flag but the checkpoint's path: the episodes of our runner, bit for bit, and files that `replay:` plays.
-
-    What LeRobot records of a policy with a task vector has it as a column.
-    """
+    """No flag but the checkpoint's path: the episodes of our runner, bit for bit, and files that `replay:` plays."""
     flags = ["--eval.n_episodes=2", "--eval.batch_size=1", "--seed=0", f"--env.episode_length={TICKS}"]
-    flags += [f"--env.episodes={tmp_path / 'kept'}", f"--output_dir={tmp_path / 'out'}", "--eval.recording=true"]
+    flags += [f"--env.episodes={tmp_path / 'kept'}", f"--output_dir={tmp_path / 'out'}"]
     argv(monkeypatch, checkpoint, *flags)
     eval_main()
     lines = [json.loads(line) for line in (tmp_path / "kept" / "outcomes.jsonl").read_text().splitlines()]
@@ -225,9 +222,15 @@ def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch,
     policy = policies.get(f"replay:{tmp_path / 'kept' / 'actions'}")
     assert isinstance(policy, ReplayEpisodes)
     policy.close()
+
+
+def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_path):
+    """What LeRobot records of a policy with a task vector has it as a column."""
+    flags = ["--eval.n_episodes=1", "--eval.batch_size=1", "--seed=0", "--env.episode_length=3"]
+    argv(monkeypatch, checkpoint, *flags, f"--output_dir={tmp_path / 'out'}", "--eval.recording=true")
+    eval_main()
     recorded = LeRobotDataset("eval_recording", root=tmp_path / "out" / "recordings" / "boxing_0")
-    assert recorded.num_frames == 2 * TICKS
-    assert recorded[2]["observation.environment_state"].tolist() == [1.0, 0.0]
+    assert recorded.num_frames == 3 and recorded[2]["observation.environment_state"].tolist() == [1.0, 0.0]
 
 
 def test_the_vector_names_the_task():

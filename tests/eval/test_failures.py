@@ -65,6 +65,21 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
 
 
 @pytest.mark.parametrize(
+    ("stage", "moved", "declared"),
+    [
+        ("recovery", 0.4, {}),
+        ("contact", 0.4, {"carried": True}),
+        ("contact", 0.0, {}),
+        ("approach", 0.0, {"reached_only": True}),
+    ],
+)
+def test_a_further_task_is_judged_by_what_it_declares(monkeypatch, stage, moved, declared):
+    """Whether an object is carried or only reached is read of a task's entry, whatever its name."""
+    monkeypatch.setitem(INTERACTIONS, "push_bin", dataclasses.replace(INTERACTIONS["boxing"], **declared))
+    assert stage_of(judged(task="push_bin", moved=moved)) == stage
+
+
+@pytest.mark.parametrize(
     ("stage", "outcome", "changes"),
     [
         ("perception", "timeout", NOT_NEAR),

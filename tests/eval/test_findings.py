@@ -19,7 +19,7 @@ from arena_newton.eval.tables import findings_text, paper_claims
 from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import paper_numbers
-from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
+from arena_newton.tasks.semantic_mode import semantic_note
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -79,7 +79,7 @@ def test_findings_follow_the_data(cells):
     assert found["perturbation: visual drop"].ours.startswith("+25.0 points (")
     assert found["perturbation: visual drop"].paper == "+9.2 points"
     assert found["perturbation: visual against execution"].verdict == "not measured"
-    assert SEMANTIC_STRENGTH in found["perturbation: visual against semantic"].remark
+    assert semantic_note() in found["perturbation: visual against semantic"].remark
     assert "clutter 0.0 (1 cell), texture 0.0 (2 cells)" in found["perturbation: visual against semantic"].ours
     assert found["cross-GMT: twist2 → sonic"].paper == "+39.9 points on average; nothing left in 22 of 28 cells"
     said = "twist2 HOI: FM 36.1 %; twist2 HSI: FM 58.8 %; sonic HOI: DP 52.2 %; sonic HSI: DP 65.8 %"
@@ -179,7 +179,7 @@ def test_pages_of_results_are_those_of_their_records(tmp_path, monkeypatch):
     for name in ("README.md", "findings.md"):
         assert (tmp_path / name).read_text() == (RESULTS / name).read_text(), name
     text = (RESULTS / "README.md").read_text()
-    assert text.count(BEGIN) == text.count(END) == 1 and semantic_text() in text and SEMANTIC_STRENGTH in text
+    assert text.count(BEGIN) == text.count(END) == 1 and semantic_note() in text
 
 
 def ends(both=0, only_first=0, only_second=0, neither=0):

@@ -1,5 +1,7 @@
 """What the driver of `run --ray` does with what processes tell: nothing is lost, nothing counts twice."""
 
+from types import SimpleNamespace
+
 import pytest
 from eval_fakes import FakePolicy, factories
 
@@ -12,13 +14,13 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
 from arena_newton.eval.play.run_flow import begun, progress_of
 from arena_newton.eval.records.journal import Journal, read_journal
-from arena_newton.eval.workers.slice_events import Ended, Slice
+from arena_newton.eval.workers import dealing
+from arena_newton.eval.workers.slice_events import Done, Ended, Slice
 from arena_newton.eval.workers.slice_player import play
+from arena_newton.eval.workers.worker_pool import Job, Lost, Worker
 from arena_newton.physics import devices
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
-from arena_newton.eval.workers import ray_run  # noqa: E402
-from arena_newton.eval.workers.worker_pool import Done, Job, Lost, Worker  # noqa: E402
 
 PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
 
@@ -29,7 +31,7 @@ class StubPool:
     def __init__(self, job, size, lost=lambda assignment, told: None, made_of=None):
         self.folder, self.workers, self.lost = job.folder, [Worker(job=job) for _ in range(size)], lost
         self.made_of, self.shown = made_of or factories(), None
-        self.policy = FakePolicy("expert")
+        self.policy, self.backend = FakePolicy("expert"), SimpleNamespace(flag="--ray")
         self.sizes = []
 
     def idle(self):
@@ -74,7 +76,7 @@ def driven(tmp_path):
         with Journal(folder.journal) as journal:
             folder.settle(config, journal.records)
             done, waiting = begun(config, folder, journal)
-            ray_run._play(ray_run.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
+            dealing._play(dealing.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         return read_journal(folder.journal)[0], pool, folder
 
     return drive
@@ -202,9 +204,15 @@ FLAGS = ["run", "--task", "boxing", "--engine", "mujoco"]
         (["--ray", "--device", "cuda"], "--device cuda: engine mujoco runs on the CPU"),
         (["--ray", "--device", "tpu"], "--device tpu: unknown"),
         (["--ray", "--viewer", "usd"], "--viewer: shows worlds of this process"),
+        (["--jobs", "2", "--viewer", "usd"], "--viewer: shows worlds of this process"),
+        (["--jobs", "2", "--ray"], "--jobs 2: are processes of this machine, not of --ray"),
+        (["--jobs", "2", "--ray-minutes", "1"], "--ray-minutes: belongs to --ray, which is not given"),
+        (["--jobs", "0"], "--jobs 0: expected 1 to 256"),
+        (["--jobs", "2", "--device", "cuda"], "--device cuda: engine mujoco runs on the CPU"),
+        (["--jobs", "2", "--device", "cuda:1"], "--device cuda:1: --jobs takes all GPUs in turn"),
     ],
 )
-def test_wrong_flags_are_refused_before_ray_starts(flags, said, tmp_path, capsys):
+def test_wrong_flags_are_refused_before_a_process_starts(flags, said, tmp_path, capsys):
     """Each is one line with exit code 2, and no folder is made."""
     assert main([*FLAGS, *flags, "--out", str(tmp_path / "r")], factories()) == 2
     error = capsys.readouterr().err
@@ -221,8 +229,9 @@ def test_a_missing_extra_is_one_line(tmp_path, capsys, monkeypatch):
 
 
 def test_engine_of_a_cluster(monkeypatch, tmp_path):
-    """Processes on GPUs are asked for by engine, device or fraction; nothing is looked for on this machine."""
+    """Processes on GPUs are asked for by engine, device or fraction; Warp looks for nothing on this machine."""
     gpus = tmp_path / "gpus"
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(devices, "NVIDIA_DEVICES", gpus)
     assert devices.cluster_engine("auto", None, None) == ("mujoco", "cpu")
     assert devices.cluster_engine("auto", None, 0.5) == ("warp", "cuda:0")
@@ -232,3 +241,7 @@ def test_engine_of_a_cluster(monkeypatch, tmp_path):
     (gpus / "0000:01:00.0").mkdir(parents=True)
     assert devices.cluster_engine("auto", None, None) == ("warp", "cuda:0")
     assert devices.cluster_engine("mujoco", None, None) == ("mujoco", "cpu")
+    for named, seen in (("3, 1", ["3", "1"]), ("1,-1,0", ["1"]), ("", [])):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
+        assert devices.visible_gpus() == seen
+        assert devices.cluster_engine("auto", None, None) == (("warp", "cuda:0") if seen else ("mujoco", "cpu"))

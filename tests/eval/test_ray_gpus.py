@@ -48,11 +48,13 @@ CREW = """
 import functools, ray
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.worker_pool import WorkerPool, in_cluster
+from arena_newton.eval.workers.ray_backend import RayBackend, in_cluster
+from arena_newton.eval.workers.worker_pool import WorkerPool
 ray.init = functools.partial(ray.init, num_cpus=4, num_gpus=2)
 with in_cluster(()):
     for gpus, number in ((1, 2), (0.5, 4)):
-        pool = WorkerPool(resolve(RunOptions(ray=(), engine="warp", ray_cpus=1, ray_gpus=gpus)), 8, None)
+        flags = RunOptions(ray=(), engine="warp", ray_cpus=1, ray_gpus=gpus)
+        pool = WorkerPool(RayBackend(flags, resolve(flags).device), 8, None)
         while len(pool.idle()) < number:
             list(pool.messages())
         print(len(pool.workers), *sorted(worker.node.gpus for worker in pool.workers))

@@ -1,4 +1,4 @@
-"""`eval matrix --ray`: one pool plays the cells of a suite, several at once; what is lost is played again.
+"""`eval matrix --ray` and `--jobs`: one pool plays the cells of a suite, several at once; what is lost is played again.
 
 Processes are objects of this process, which answer in turn; a test says when one dies.
 """
@@ -23,10 +23,10 @@ from arena_newton.eval.workers.shard_merge import merge
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.suites import ray_suite  # noqa: E402
-from arena_newton.eval.workers import ray_run, worker_pool  # noqa: E402
-from arena_newton.eval.workers.ray_actor import EpisodeActor  # noqa: E402
-from arena_newton.eval.workers.slice_events import Node  # noqa: E402
+from arena_newton.eval.workers import local_backend, ray_backend, worker_pool  # noqa: E402
+from arena_newton.eval.workers.actor import EpisodeActor  # noqa: E402
+from arena_newton.eval.workers.backend import WorkerLost  # noqa: E402
+from arena_newton.eval.workers.slice_events import Done, Node  # noqa: E402
 
 
 class Answer:
@@ -51,7 +51,7 @@ class InlineRay:
 
     def _actor(self, gpu):
         self.actors += 1
-        actor, number = EpisodeActor(gpu=True), self.actors
+        actor, number = EpisodeActor(), self.actors
 
         def opening(options, folder, cores, made_of):
             self.opened.append((number, folder))
@@ -76,19 +76,43 @@ class InlineRay:
         self.killed += 1
 
 
+class InlineProcess:
+    """A process of --jobs, whose answers are those of an actor of `InlineRay`."""
+
+    def __init__(self, fake, gpu):
+        self.fake, self.gpu, self.runs, self.pipe, self.actor = fake, gpu, True, self, fake._actor(gpu)
+
+    def ask(self, method, *arguments):
+        called = getattr(self.actor, method)
+        self.answers = called.options("streaming").remote(*arguments) if method == "play" else None
+        self.answer = called.remote(*arguments) if method != "play" else None
+
+    def take(self):
+        answer = self.answer if self.answers is None else next(self.answers, None)
+        if self.fake.dies():
+            raise WorkerLost
+        return Done() if answer is None else answer.work()
+
+    def end(self):
+        self.runs = False
+        self.fake.killed += 1
+
+
 def stand_in(patch, dies=lambda: False, cores=2.0):
-    """Put a stand-in with so many cores in Ray's place."""
+    """Put a stand-in with so many cores in the place of Ray and of the processes of --jobs."""
     found = InlineRay(dies, cores)
-    patch.setattr(worker_pool, "ray", found)
+    patch.setattr(ray_backend, "ray", found)
+    patch.setattr(ray_backend, "in_cluster", lambda address: contextlib.nullcontext())
+    patch.setattr(local_backend, "LocalProcess", functools.partial(InlineProcess, found))
+    patch.setattr(local_backend, "connection", SimpleNamespace(wait=lambda pipes, timeout: pipes))
     patch.setattr(worker_pool, "FIRST_PAUSE", 0.0)
-    for module in (ray_run, ray_suite):
-        patch.setattr(module, "in_cluster", lambda address: contextlib.nullcontext())
+    patch.setenv("OMP_NUM_THREADS", "2")
     return found
 
 
 @pytest.fixture
 def inline(monkeypatch):
-    """Makes a stand-in for Ray."""
+    """Makes a stand-in for processes, of Ray or of --jobs."""
     return functools.partial(stand_in, monkeypatch)
 
 
@@ -109,9 +133,12 @@ def alone(tmp_path_factory):
     return folder / "out"
 
 
-def call(suite, out, *flags, **changes):
-    """Exit code of `eval matrix --ray` with processes of one core."""
-    command = ["matrix", str(suite), "--out", str(out), "--ray", "--ray-cpus", "1", *flags]
+RAY, JOBS = ("--ray", "--ray-cpus", "1"), ("--jobs", "2")
+
+
+def call(suite, out, *flags, by=RAY, **changes):
+    """Exit code of `eval matrix` with processes of one core."""
+    command = ["matrix", str(suite), "--out", str(out), *by, *flags]
     return main(command, factories(**changes))
 
 
@@ -159,12 +186,12 @@ def test_one_crew_for_all_cells(undisturbed):
     assert changes <= 4, groups
 
 
-@pytest.mark.parametrize("every", [5, 11])
-def test_losses_lose_nothing(inline, suite, alone, tmp_path, every):
+@pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
+def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)
     fake = inline(lambda: next(count) % every == 0)
-    assert call(suite, tmp_path / "out", "--ray-attempts", "99") == 0
+    assert call(suite, tmp_path / "out", by=by) == 0
     assert journals(tmp_path / "out") == journals(alone)
     assert fake.killed > 2
 

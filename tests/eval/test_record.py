@@ -28,7 +28,7 @@ from tests.children import Child
 
 SMALL = ["--task", "boxing", "--size", "64x64", "--engine", "mujoco", "--device", "cpu"]
 COUNT = 3
-BRIEF = [*SMALL, "--episodes", str(COUNT)]
+BRIEF = [*SMALL, "--policy", "stand", "--episodes", str(COUNT)]
 """Episodes in worlds where each soon succeeds: what counts is what happens to their files."""
 
 

@@ -2,9 +2,11 @@
 
 import csv
 import dataclasses
+import inspect
 import io
 import json
 import re
+import runpy
 import shutil
 import subprocess
 
@@ -19,14 +21,9 @@ from arena_newton.eval.tables import table_text
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import paper_numbers, published, read_paper
 from arena_newton.eval.tables.suite_tables import suite_tables
-from arena_newton.eval.tables.table_entries import (
-    SEMANTIC_STRENGTH,
-    SuiteTable,
-    interval_text,
-    probability,
-    semantic_text,
-)
+from arena_newton.eval.tables.table_entries import SuiteTable, interval_text, probability
 from arena_newton.pages.tables import points
+from arena_newton.tasks.semantic_mode import semantic_note
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +114,7 @@ def test_semantic_numbers_say_what_was_changed(tables):
     assert {"Football (texture)", "P&PBox (clutter)"} <= set(tables["in_gmt_semantic"].head)
     for name, table in tables.items():
         semantic = name in ("in_gmt_semantic", "perturbation")
-        assert (SEMANTIC_STRENGTH in table.caption) == (semantic_text() in table.caption) == semantic, name
+        assert (semantic_note() in table.caption) == semantic, name
 
 
 @pytest.mark.parametrize(
@@ -193,7 +190,8 @@ def test_a_mode_that_the_paper_lacks_changes_no_other_table(cells, tables, monke
     """A further mode gets its table; the paper's numbers are read as ever, and the profile says that it lacks it."""
     monkeypatch.setattr("arena_newton.rules.rule_types.MODES", ("base", "execution", "semantic", "visual", "dynamics"))
     further = [dataclasses.replace(c, mode="dynamics") for c in cells.cells if c.mode == "visual"]
-    found = {t.name: t for t in suite_tables([*cells.cells, *further], read_paper())}
+    paper = runpy.run_path(inspect.getfile(read_paper))["read_paper"]()  # imported with the mode
+    found = {t.name: t for t in suite_tables([*cells.cells, *further], paper)}
     assert set(found) == {*tables, "in_gmt_dynamics"}
     assert found["perturbation"].rows == tables["perturbation"].rows
     assert "Without dynamics" in found["perturbation"].caption and "Without" not in tables["perturbation"].caption

@@ -9,7 +9,9 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.statistics.stats import aggregate, wilson
 from arena_newton.eval.tables.run_table import joint_table
-from arena_newton.eval.tables.table_entries import SEMANTIC_STRENGTH, semantic_text
+from arena_newton.pages.tables import escaped
+from arena_newton.policies.learned.learned_card import CellResult, PolicyCard
+from arena_newton.tasks.semantic_mode import semantic_note
 
 
 def run_of(tmp_path, name, rows, **config):
@@ -63,12 +65,22 @@ def test_what_is_missing_is_said(tmp_path):
     assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error; they count" in text
 
 
-def test_semantic_numbers_say_what_they_are(tmp_path):
-    """A table with semantic mode says what that changes and who chose its strength; one without does not."""
-    for mode in ("base", "semantic"):
-        rows = [row | {"mode": mode} for row in episodes("football", (4, 5, 7))]
-        text = joint_table([run_of(tmp_path, "a", rows)])
-        assert (SEMANTIC_STRENGTH in text) == (semantic_text() in text) == (mode == "semantic")
+@pytest.mark.parametrize("mode", ["base", "semantic"])
+def test_semantic_numbers_say_what_they_are(tmp_path, capsys, mode):
+    """Where numbers of semantic mode are, it is said what that changes and who chose its strength; elsewhere not."""
+    a, b = tmp_path / "a", tmp_path / "b"
+    for folder in (a, b):
+        rows = [row | {"mode": mode, "privileged": True} for row in episodes("football", (4, 5, 7))]
+        folder_with(folder, rows, 60, policy_facts={"privileged": True})
+    assert main(["report", str(a), "--table"]) == 0
+    pages = [capsys.readouterr().out]
+    assert main(["report", str(a)]) == main(["compare", str(a), str(b), "--out", str(tmp_path / "c")]) == 0
+    comparison = (tmp_path / "c" / "compare.md").read_text()
+    cell = CellResult(task="football", tracker="twist2", mode=mode, episodes=60, successes=16, falls=0)
+    pages += [comparison, (a / "report.md").read_text(), PolicyCard(tasks=("football",), results=(cell,)).to_markdown()]
+    for page in pages:
+        assert (semantic_note() in page or escaped(semantic_note()) in page) == (mode == "semantic"), page
+    assert "p (privileged)" in comparison
 
 
 @pytest.mark.parametrize(

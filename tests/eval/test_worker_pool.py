@@ -15,13 +15,13 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
-from arena_newton.eval.workers.slice_events import Broke, Built, Node, Opened, Ticks
+from arena_newton.eval.workers.slice_events import Broke, Built, Done, Node, Opened, Ticks
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.workers import worker_pool  # noqa: E402
-from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, WorkerPool  # noqa: E402
+from arena_newton.eval.workers import ray_backend, worker_pool  # noqa: E402
+from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, WorkerPool  # noqa: E402
 
 
 class Ref:
@@ -124,10 +124,10 @@ def pool_of(tmp_path, monkeypatch):
             "cpu",
         )
         fake = FakeRay(dataclasses.replace(said, **(opened or {})), nodes or [node()])
-        monkeypatch.setattr(worker_pool, "ray", fake)
+        monkeypatch.setattr(ray_backend, "ray", fake)
         folder = ResultsFolder(tmp_path / "r", planned, doctor.versions())
         folder.document = {"config_hash": config.hash}
-        pool = WorkerPool(planned, len(planned.episodes), None)
+        pool = WorkerPool(ray_backend.RayBackend(planned.flags, planned.device), len(planned.episodes), None)
         pool.job = Job(folder)
         return pool, fake, config
 
@@ -147,7 +147,7 @@ def messages(pool, rounds=6):
 
 def all_idle(pool):
     """Hear until all have opened the run."""
-    while not (pool.workers and all(worker.job is pool.job and worker.pending is None for worker in pool.workers)):
+    while not (pool.workers and all(worker.job is pool.job and not worker.busy for worker in pool.workers)):
         for worker in pool.idle():
             if worker.job is not pool.job:
                 pool.prepare(worker, pool.job)
@@ -218,7 +218,7 @@ def test_processes_that_never_begin_stop_the_run(pool_of, monkeypatch):
     monkeypatch.setattr(worker_pool, "LONGEST_PAUSE", 0.0)
     pool, fake, _ = pool_of(ray_actors=1)
     fake.opened = Broke("broken", "ImportError: no newton", "a trace")
-    with pytest.raises(RunStopped, match="--ray: 5 processes on host ended one after the other: ImportError"):
+    with pytest.raises(RunStopped, match="--ray a:1: 5 processes on host ended one after the other: ImportError"):
         pool.opened(pool.job)
     assert len(fake.asked) == 5
 
@@ -226,7 +226,7 @@ def test_processes_that_never_begin_stop_the_run(pool_of, monkeypatch):
 def test_other_code_or_versions_are_refused(pool_of):
     """A node that would play something else is named, with what differs."""
     versions = doctor.versions() | {"mujoco": "3.0"}
-    with pytest.raises(InputError, match=r"--ray: on node host mujoco is 3\.0, here .*; all nodes need the same code"):
+    with pytest.raises(InputError, match=r"--ray a:1: on node host mujoco is 3\.0, here .*; all nodes need the"):
         pool, _, _ = pool_of(opened={"versions": versions})
         pool.opened(pool.job)
     pool, fake, config = pool_of()
@@ -240,8 +240,14 @@ def test_other_code_or_versions_are_refused(pool_of):
 
 
 def test_the_driver_loads_no_physics():
-    """What deals episodes out runs on a machine without GPU or simulator: neither torch nor Warp is imported."""
+    """What deals episodes out runs on a machine without GPU or simulator: neither torch nor Warp is imported.
+
+    A process that plays begins alike, so that its cores and GPU are settled before they load.
+    """
     heavy = "{'torch', 'warp', 'newton', 'mujoco'}"
-    program = f"import sys, arena_newton.eval.workers.ray_run\nprint(*{heavy} & set(sys.modules))"
+    names = "dealing", "local_backend", "ray_backend"
+    program = (
+        f"import sys\nfrom arena_newton.eval.workers import {', '.join(names)}\nprint(*{heavy} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.split() == []

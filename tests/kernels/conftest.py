@@ -1,7 +1,9 @@
 """What the kernel tests share: devices, random stages, and rotations and boxes in plain NumPy (matrices, float64)."""
 
 import itertools
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +12,7 @@ import warp as wp
 
 from arena_newton.kernels.rules import success
 
+sys.path.insert(0, str(Path(__file__).parent))
 wp.config.quiet = True
 
 

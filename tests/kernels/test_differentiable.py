@@ -1,9 +1,5 @@
 """Gradients through `wp.Tape` agree with central differences of the very kernels, and torch's autograd sees them."""
 
-import subprocess
-import sys
-import textwrap
-
 import numpy as np
 import pytest
 import torch
@@ -13,6 +9,7 @@ from arena_newton.differentiable import ReferenceState, reference_step, success_
 from arena_newton.kernels import canonical
 from arena_newton.kernels.rules import success
 from arena_newton.robot import g1
+from tests.children import Child
 
 WORLDS = 64
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -238,21 +235,6 @@ def test_margin_needs_a_float_tensor(device, twin):
 
 def test_first_call_of_a_process():
     """Both functions work, gradients and all, when nothing in the process has called Warp before."""
-    calls = (
-        "state = differentiable.ReferenceState(torch.zeros(2, 3), torch.tensor([[1.0, 0, 0, 0]] * 2),\n"
-        "    torch.zeros(2, 29), *torch.zeros(3, 2), torch.zeros(2, dtype=torch.int32), torch.zeros(2, 29))\n"
-        "x = torch.zeros(2, 40); x[:, 3] = x[:, 6] = 1.0; x.requires_grad_()\n"
-        "differentiable.reference_step(x, state)[0].sum().backward()\n",
-        "x = torch.zeros(2, 9); x[:, 2], x[:, 3] = 0.8, 1.0; x.requires_grad_()\n"
-        "differentiable.success_margin(success.launch_open_door_released, qpos=x, root_qpos_adr=0,\n"
-        "    leaf_qpos_adr=7, latched=torch.zeros(2, dtype=torch.int32), min_angle=1.0, stand_height=0.45,\n"
-        "    stand_up=0.6).sum().backward()\n",
-    )
-    lines = (
-        "import os, torch\nfrom arena_newton import differentiable\nfrom arena_newton.kernels.rules import success\n"
-    )
-    for call in calls:  # each in a process of its own, of one that has imported all and called nothing
-        body = textwrap.indent(f"{call}assert x.grad.isfinite().all()\nos._exit(0)\n", "    ")
-        lines += f"if (child := os.fork()) == 0:\n{body}assert os.waitpid(child, 0)[1] == 0\n"
-    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-1500:]
+    for child in [Child("first_call", [name]) for name in ("reference_step", "success_margin")]:
+        _, complaints = child.communicate(300)
+        assert child.returncode == 0, complaints[-1500:]

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -366,8 +367,12 @@ def test_a_part_of_the_suite_has_no_verdict_on_falls():
     assert not any("whole suite" in name or "official" in name for name in verdicts)
 
 
-def test_command_line_writes_tables_side_by_side(tmp_path, capsys):
+def test_command_line_writes_tables_side_by_side(tmp_path, capsys, monkeypatch):
     """Two trackers stand in one table; Markdown, JSON and CSV hold every cell."""
+    short = [
+        replace(cell, seconds=1.0, script=primitives.stand(1.0)) for cell in suite("quick") if cell.name == "stand"
+    ]
+    monkeypatch.setattr("arena_newton.trackers.evaluation.cells.suite", lambda name: short)
     arguments = "--tracker pd --label a --tracker pd --label b --suite quick --only stand --rollouts 2".split()
     arguments += ["--engine", "mujoco", "--threads", "1", "--no-bench", "--out", str(tmp_path)]
     assert main(arguments) == 0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from arena_newton import rule_sets, tasks
-from arena_newton.eval.tables.table_entries import semantic_text, task_title
 from arena_newton.physics.scene import SCENES, load_scene
+from arena_newton.tasks.semantic_mode import semantic_note, task_title
 
 TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
 OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")
@@ -257,7 +257,7 @@ def test_semantic_mode_changes_what_its_task_says(task):
         assert differing == set()
     colours = [s.model.shape_color.numpy() for s in (base, changed)]
     assert base.model.shape_label != changed.model.shape_label or not np.array_equal(*colours)
-    assert task_title(task) in semantic_text()
+    assert task_title(task) in semantic_note()
 
 
 def test_variant_by_override_alone(tmp_path):

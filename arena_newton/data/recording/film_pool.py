@@ -41,7 +41,8 @@ from arena_newton.data.recording.film_process import SlotMemory, packed, unpacke
 from arena_newton.errors import ArenaError
 from arena_newton.files.interrupts import Uninterrupted
 from arena_newton.files.own_files import PARTIAL
-from arena_newton.files.own_processes import environment, pin, unpin
+from arena_newton.files.own_processes import environment
+from arena_newton.files.pinned_memory import pin, unpin
 
 __all__ = ["FilmPool"]
 

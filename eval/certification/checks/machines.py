@@ -49,7 +49,7 @@ ENDING = 60.0
 """Time for the cluster to end when it is told to [s]."""
 COMMAND = (sys.executable, "-P", "-m", "arena_newton.eval")
 """Command that plays on a cluster."""
-ACTOR = b"ray::EpisodeActor.play"
+ACTOR = b"ray::RayActor.play"
 """Title prefix of a process while it plays for a cluster."""
 REPLACED = "left: a process"
 """Message of a run about a process that it lost with the episodes that it played."""

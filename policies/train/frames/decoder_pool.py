@@ -30,7 +30,8 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.interrupts import Uninterrupted
-from arena_newton.files.own_processes import environment, pin, unpin
+from arena_newton.files.own_processes import environment
+from arena_newton.files.pinned_memory import pin, unpin
 from arena_newton.policies.train.frames.decoder_process import SLOTS, EpisodeDecoder, chunk, mapped
 
 __all__ = ["DecoderPool", "EpisodeFilm", "decoding_processes"]

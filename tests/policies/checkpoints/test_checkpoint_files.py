@@ -379,7 +379,7 @@ def test_a_hub_that_does_not_answer(tmp_path, monkeypatch):
         monkeypatch.setattr(hub_folder, "PATIENCE", 0.2)
         for name, value in {"ENDPOINT": address, "HF_HUB_OFFLINE": False, "HF_HUB_CACHE": str(tmp_path)}.items():
             monkeypatch.setattr(huggingface_hub.constants, name, value)
-        with pytest.raises(InputError, match="--policy lerobot:nobody/nothing: is no folder here, .* timed out"):
+        with pytest.raises(InputError, match="--policy lerobot:nobody/nothing: is no folder here, .*timed out"):
             hub_folder.fetched("nobody/nothing")
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
-from made_checkpoints import CHUNK, edit, facts, follow, save, seen
+from made_checkpoints import CHUNK, WIDTHS, edit, facts, follow, save, seen
 from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
@@ -87,6 +87,7 @@ def test_lerobot_is_not_imported(packed):
     """A packed policy is read, loaded and run without LeRobot and torchvision, whose import takes seconds."""
     code = (
         "import sys, torch; from arena_newton import policies; from arena_newton.policies import Observation\n"
+        f"from arena_newton.policies.learned import act_network; act_network.WIDTHS = {WIDTHS}\n"
         f"policy = policies.get('learned:{packed}'); policy.check()\n"
         "picture = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)\n"
         "seen = Observation(torch.zeros(1, 64), picture, [True], 'boxing', 'boxing', 'Strike.')\n"

@@ -21,7 +21,7 @@ from served_policies import Remembers, look, state, together
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.arena_codec import unpack_look
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.serve import door_guard, message_readers
+from arena_newton.policies.serve import door_guard, message_readers, websocket_listener
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -61,16 +61,42 @@ def test_a_connection_that_cannot_be_taken_ends_no_door(served, protocol):
     client.close()
 
 
-def test_deaf_clients_do_not_hold_up_the_end(served):
-    """A door closes at once, however many clients neither answer nor read."""
-    one = served(Remembers(), connections=8)
-    deaf = [plain_socket(one.port)[0] for _ in range(4)]
+def talkative():
+    """A policy with answers of 320 kB."""
+    policy = Remembers()
+    policy.chunk_size = 2000
+    return policy
+
+
+def stuff(connection):
+    """Send looks until neither side's buffer takes any more, and return one."""
     frame = openpi_codec.pack_request(look(seed=1, step=0))
     frame = b"\x82\xfe" + struct.pack(">H", len(frame)) + bytes(4) + frame
-    deaf[0].settimeout(0.5)
+    connection.settimeout(0.5)
     with suppress(TimeoutError):
-        for _ in range(20000):  # until neither side's buffer takes any more
-            deaf[0].sendall(frame)
+        for _ in range(20000):
+            connection.sendall(frame)
+    return frame
+
+
+def test_a_client_that_reads_nothing_is_hung_up_on(served, monkeypatch):
+    """A client that reads no answer for a time is left, so that its thread and its row are free."""
+    monkeypatch.setattr(websocket_listener, "SEND_SECONDS", 1.0)
+    one = served(talkative())
+    deaf, _ = plain_socket(one.port)
+    frame = stuff(deaf)
+    deaf.settimeout(15)
+    with pytest.raises(ConnectionError):
+        while True:
+            deaf.sendall(frame)
+    deaf.close()
+
+
+def test_deaf_clients_do_not_hold_up_the_end(served):
+    """A door closes at once, however many clients neither answer nor read."""
+    one = served(talkative(), connections=8)
+    deaf = [plain_socket(one.port)[0] for _ in range(4)]
+    stuff(deaf[0])
     began = time.monotonic()
     one.door.close()
     assert time.monotonic() - began < 4.0

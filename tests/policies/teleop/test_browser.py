@@ -147,10 +147,12 @@ def test_a_page_that_reads_nothing_delays_nobody(server):
     with deaf_page(server):
         fill(server)
         server.publish({"tick": 2}, None)
+        began = time.monotonic()
         with page_socket(server) as second:
             assert json.loads(second.recv(timeout=READY))["kind"] == "facts"
             second.send('{"turn": 1}')
             wait_for(lambda: server.held()[0].turn == 1.0, "message of the second page")
+        assert time.monotonic() - began < 8.0, "a socket whose page does not answer takes 10 s to close"
     with deaf_page(server):
         fill(server)
         ending = threading.Thread(target=server.close, daemon=True)

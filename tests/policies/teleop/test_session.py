@@ -1,6 +1,7 @@
 """The session: real time, dead-man, episodes that a person saves or discards."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.files.new_folder import held_folder
+from arena_newton.policies.teleop import driving_command
 from arena_newton.policies.teleop.driving import EVENTS, RANGES, Driver, Held, read_held
 from arena_newton.policies.teleop.driving_command import session_facts
 from arena_newton.policies.teleop.pace import STARVED, Pace, TimedPicture
@@ -253,6 +256,16 @@ def saved(env, tmp_path_factory):
     source = Script({0: "start", 60: "save_and_reset", 61: "start", 80: "discard_and_reset"}, quit_at=85)
     one = session(env, source, folder, facts=session_facts(env, BrowserOptions()))
     return one.run(), folder, source
+
+
+def test_two_sessions_save_in_no_one_folder(tmp_path):
+    """A folder in which another session saves is refused, and world and source are closed."""
+    closed = []
+    given = SimpleNamespace(close=lambda: closed.append(True))
+    said = "--out .*: another process saves a person's episodes in it"
+    with held_folder(tmp_path, "holds it"), pytest.raises(InputError, match=said):
+        driving_command.drive(given, given, BrowserOptions(out=str(tmp_path)))
+    assert closed == [True, True]
 
 
 def test_any_episode_of_the_seed_is_in_the_way(env, tmp_path):

@@ -31,19 +31,13 @@ def narrow(monkeypatch):
 
 
 @pytest.fixture
-def tiny(monkeypatch):
+def compiler(monkeypatch):
     """A network that draws no random numbers, of which a compiler draws others, and is compiled in seconds."""
-    sizes = {"dropout": 0.0, "use_vae": False, "n_encoder_layers": 1, "n_decoder_layers": 1}
-    monkeypatch.setattr(training, "recipe", lambda family, name, **more: recipe(family, name, network=sizes, **more))
-
-
-@pytest.fixture
-def compiler(tiny):
-    """A compiler that is there."""
     if not shutil.which("g++"):
         pytest.skip("needs g++ (Debian: apt-get install g++)")
-    # One thread, no vectors and no optimisation: the same graphs, of which a compiler makes a program in a few seconds.
-    with torch._inductor.config.patch({"compile_threads": 1, "cpp.simdlen": 1, "aot_inductor.debug_compile": True}):
+    sizes = {"dropout": 0.0, "use_vae": False, "n_encoder_layers": 1, "n_decoder_layers": 1}
+    monkeypatch.setattr(training, "recipe", lambda family, name, **more: recipe(family, name, network=sizes, **more))
+    with torch._inductor.config.patch(compile_threads=1):
         yield
     torch.compiler.reset()
 
@@ -135,7 +129,7 @@ def test_a_missing_compiler_is_said_at_once(dataset, tmp_path, monkeypatch):
         network_compiler.check_compiler(torch.device("cuda"))
 
 
-def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, tiny, monkeypatch):
+def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, monkeypatch):
     """What the compiler says is in one line of ours; errors of other kinds stay what they are."""
     broken = tmp_path / "g++"
     broken.write_text("#!/bin/sh\necho broken >&2\nexit 1\n")

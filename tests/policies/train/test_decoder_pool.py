@@ -172,16 +172,9 @@ def test_ctrl_c_leaves_nothing(rows):
     assert not decoders() and not shared_files()
 
 
-def idle_pool(_):
-    """A process that has asked for no pictures yet, and says who would decode them."""
-    pool = DecoderPool(64, 64, threads=1, processes=2)
-    print(*(one.process.pid for one in pool._workers), flush=True)
-    time.sleep(600)
-
-
 def test_processes_end_with_a_training_that_is_killed():
     """`kill -9` of whoever asked for pictures leaves no process."""
-    training = Child(f"{__name__}:idle_pool", [])
+    training = Child("tests.policies.train.pool_owners:idle", [])
     numbers = " ".join(training.lines(1)).split()
     training.kill()
     assert len(numbers) == 2, training.printed()
@@ -234,16 +227,9 @@ def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypa
     assert torch.equal(load_frames([rows], CPU, processes=2).pictures, wanted.pictures)
 
 
-def pool_without_input(_):
-    """A pool of a process whose standard input is closed; 0 if its memory is in no stream's position."""
-    os.close(0)
-    with DecoderPool(64, 64, threads=1, processes=1) as pool:
-        return int(pool._fd <= 2)
-
-
 def test_processes_start_where_the_standard_input_is_closed():
     """Whoever started the training may have closed its input: memory is not in its position."""
-    child = Child(f"{__name__}:pool_without_input", [])
+    child = Child("tests.policies.train.pool_owners:without_input", [])
     assert child.wait(300) == 0, child.printed()
 
 

@@ -224,6 +224,7 @@ def narrow_main(arguments):
 NARROW = f"{__name__}:narrow_main"
 
 
+@pytest.mark.release
 def test_a_killed_training_goes_on(dataset, tmp_path):
     """After kill -9 at any moment `last` is a whole checkpoint, with which the training goes on."""
     out = tmp_path / "run"
@@ -245,6 +246,7 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
     assert not list(out.rglob("*.part"))
 
 
+@pytest.mark.release
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
     """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
     out, agreed = tmp_path / "run", []
@@ -348,7 +350,7 @@ def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
     assert 27 <= facts.steps <= 30 and 0.45 <= facts.minutes <= 0.5
     rates = [float(row["learning_rate"]) for row in rows(tmp_path / "run")]
     low = recipe("act", "small").final_lr_fraction * max(rates)
-    assert rates[-1] == pytest.approx(low, rel=0.3) and rates[15] == pytest.approx(max(rates) / 2, rel=0.2)
+    assert rates[-1] == pytest.approx(low, rel=0.5) and rates[15] == pytest.approx(max(rates) / 2, rel=0.2)
 
 
 def test_another_time_on_resume_is_kept(dataset, tmp_path, monkeypatch):

@@ -78,7 +78,7 @@ def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
     share_stream("cuda:0")
     env = TrackerEnv(TWIST2, TWIST2.action_form("auto"), library.to("cuda:0"), TrainOptions(worlds=WORLDS), "cuda:0")
-    algorithm = make_runner(env).alg
+    algorithm = make_runner(env, steps=4).alg
     obs = env.get_observations()
     try:
         with torch.no_grad():
@@ -439,6 +439,7 @@ def second_process(arguments):
     torch.distributed.destroy_process_group()  # its threads must not outlive the interpreter
 
 
+@pytest.mark.release
 def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
     """As under torchrun on the CPU: both processes end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")

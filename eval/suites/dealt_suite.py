@@ -1,6 +1,6 @@
-"""``eval matrix --ray``: one pool of a Ray cluster plays the cells of a suite, several at once.
+"""``eval matrix --jobs`` and ``--ray``: one pool of processes plays the cells of a suite, several at once.
 
-A cell is begun when a process has opened it, and is an ordinary results folder with a journal of its own, as `ray_run`
+A cell is begun when a process has opened it, and is an ordinary results folder with a journal of its own, as `dealing`
 writes it. Processes keep their environment from cell to cell where the next one asks for the same.
 """
 
@@ -11,29 +11,26 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from ray.exceptions import RayError
-
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.play.run import Factories, RunStopped
+from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.run_flow import Group, begun, reported
 from arena_newton.eval.records.journal import Journal, StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_run import CellPlayer
-from arena_newton.eval.workers.ray_run import DealtRun
-from arena_newton.eval.workers.slice_events import Event, Opened
-from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, Worker, WorkerPool, in_cluster
-from arena_newton.files.text import counted, plain_text
+from arena_newton.eval.workers.dealing import DealtRun
+from arena_newton.eval.workers.slice_events import Done, Event, Opened
+from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 
 __all__ = ["run"]
 
 
 def run(call: SuiteCall, factories: Factories | None = None) -> int:
-    """Play the cells of a call by processes of a cluster.
+    """Play the cells of a call by other processes.
 
     Args:
-        call: Its flags name the cluster.
+        call: Its flags say which processes.
         factories: What runs are built with, importable in the processes; the real parts by default.
 
     Returns:
@@ -42,12 +39,12 @@ def run(call: SuiteCall, factories: Factories | None = None) -> int:
 
     Raises:
         InputError: A condition, a policy or the folder is wrong, here or on a node.
-        RunStopped: A cell could not be played, or no process of the cluster begins.
+        RunStopped: A cell could not be played, or no process begins.
         StorageError: The folder cannot be written.
     """
     folder = SuiteFolder(call.out, call.suite, *call.shard)
     with folder.locked(call.cells):
-        return _RayPlayer(call.suite, folder, call.options, factories, again=call.again).play(call.chosen)
+        return _PoolPlayer(call.suite, folder, call.options, factories, again=call.again).play(call.chosen)
 
 
 @dataclass(eq=False)
@@ -79,7 +76,7 @@ class _Cell:
         return self.dealt is None or self.dealt.waiting > 0
 
 
-class _RayPlayer(CellPlayer):
+class _PoolPlayer(CellPlayer):
     """Plays cells by a pool."""
 
     def play_cells(self, todo: Sequence[str]) -> bool:
@@ -92,17 +89,14 @@ class _RayPlayer(CellPlayer):
         self.shown = Progress(ticks, planned=planned)
         self.done = 0
         self.played_ticks, self.began = 0.0, time.monotonic()
-        with in_cluster(self.options.ray or ()), contextlib.ExitStack() as ended:
-            self.pool = WorkerPool(self.configs[todo[0]], planned, self.given)
+        with backend_of(self.options, self.configs[todo[0]].device) as backend, contextlib.ExitStack() as ended:
+            self.pool = WorkerPool(backend, planned, self.given)
             self.pool.shown = self.shown
-            self.shown.group(counted(len(self.pool.workers), "Ray actor"))
+            self.shown.group(f"{len(self.pool.workers)} processes")
             ended.callback(self.shown.close)
             ended.callback(self.pool.dismiss)
             try:
                 self._play()
-            except RayError as error:
-                self._leave(None)
-                raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
             except KeyboardInterrupt as error:
                 self._leave(error)
                 return False

@@ -1,4 +1,4 @@
-"""``run --ray``: processes of a Ray cluster play slices of the plan; this one deals them out and owns the journal.
+"""``run --jobs`` and ``run --ray``: processes play slices of the plan; this one deals them out and owns the journal.
 
 Numbers of episodes go out, journal lines come back; pictures and recordings are written by the processes themselves
 into the results folder. This process loads neither Warp nor torch for it.
@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shlex
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
-
-from ray.exceptions import RayError
 
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
@@ -34,9 +31,10 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.slice_events import Built, Ended, Event, Opened, Ticks
-from arena_newton.eval.workers.worker_pool import Assignment, Done, Job, Lost, Worker, WorkerPool, in_cluster
-from arena_newton.files.text import counted, plain_text
+from arena_newton.eval.workers.backend import PoolBackend
+from arena_newton.eval.workers.slice_events import Built, Done, Ended, Event, Opened, Ticks
+from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
+from arena_newton.files.text import plain_text
 from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
@@ -55,10 +53,10 @@ GIVEN_UP = 5
 
 
 def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
-    """Run or continue the run of a folder that was checked, and that of a folder inside, by processes of a cluster.
+    """Run or continue the run of a folder that was checked, and that of a folder inside, by other processes.
 
     Args:
-        folder: Of the run; its flags name the cluster.
+        folder: Of the run; its flags say which processes.
         factories: What the processes build the run with, importable there; the real parts by default.
         beside: Of the run inside.
 
@@ -70,24 +68,16 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         StorageError: The results folder cannot be written; finished episodes are kept.
         RunStopped: Simulator, tracker, policy or cluster broke down as a whole; finished episodes are kept.
     """
-    with in_cluster(folder.config.flags.ray or ()):
-        return run_and_report(folder, beside, lambda one: _played(one, factories))
+    with backend_of(folder.config.flags, folder.config.device) as backend:
+        return run_and_report(folder, beside, lambda one: _played(backend, one, factories))
 
 
-def _played(folder: ResultsFolder, factories: Factories | None) -> bool:
+def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | None) -> bool:
     """Play what is missing in a folder; False when it was interrupted."""
-    pool = WorkerPool(folder.config, len(folder.config.episodes), factories)
-    try:
-        return _played_by(pool, folder)
-    finally:
-        pool.dismiss()
-
-
-def _played_by(pool: WorkerPool, folder: ResultsFolder) -> bool:
-    """Play what is missing in a folder by a pool; False when it was interrupted."""
-    job = Job(folder)
-    resume = f"{command(folder, 'resume')} {shlex.join(['--ray', *(folder.config.flags.ray or ())])}"
+    pool, job = WorkerPool(backend, len(folder.config.episodes), factories), Job(folder)
+    resume = f"{command(folder, 'resume')} {backend.flag}"
     with contextlib.ExitStack() as ended:
+        ended.callback(pool.dismiss)
         config = pool.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
@@ -117,15 +107,13 @@ def _play(run: DealtRun) -> None:
     pool = run.pool
     try:
         with run.folder.running():
-            run.shown.group(counted(len(pool.workers), "Ray actor"))
+            run.shown.group(f"{len(pool.workers)} processes")
             while _dealt(run):
                 for _, assignment, message in pool.messages():
                     if assignment is not None and not isinstance(message, Opened):
                         run.take(assignment, message)
                     elif isinstance(message, ArenaError):
                         raise message
-    except RayError as error:
-        raise RunStopped(f"--ray: {plain_text(str(error).strip().splitlines()[0], 200)}") from None
     finally:
         run.shown.close()
 
@@ -230,7 +218,7 @@ class DealtRun:
         elif isinstance(message, Ticks):
             self.shown.tick(message.count)
         elif isinstance(message, Ended):
-            self._keep(assignment, EpisodeRecord.from_json("a process of --ray", message.line))
+            self._keep(assignment, EpisodeRecord.from_json(f"a process of {self.pool.backend.flag}", message.line))
         elif isinstance(message, Lost):
             self._again(assignment, message)
         elif isinstance(message, Done) and assignment.left:  # told of as ended without a line: no process does that

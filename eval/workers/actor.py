@@ -1,6 +1,6 @@
-"""A process of a Ray cluster that plays slices of runs: it is given numbers of episodes and gives journal lines back.
+"""A process that plays slices of runs: it is given numbers of episodes and gives journal lines back.
 
-Ray imports this module before the process knows its GPU, so torch, Warp and what needs them load inside the methods.
+It is imported before the process knows its cores and GPU, so torch, Warp and what needs them load inside the methods.
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ __all__ = ["EpisodeActor"]
 
 
 class EpisodeActor:
-    """Process of Ray that plays episodes, all in one thread, so that episodes are reported while others run."""
+    """Process that plays episodes, all in one thread, so that episodes are reported while others run."""
 
-    def __init__(self, gpu: bool):
-        """Hide the GPUs from a process that was given none: Warp would make a context on each."""
-        if not gpu:
-            os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    def __init__(self) -> None:
+        """Start the thread."""
         self._thread = ThreadPoolExecutor(1, "episodes")
         self._config: RunConfig
         self._factories: Factories | None = None
@@ -39,10 +37,7 @@ class EpisodeActor:
 
     def node(self) -> Node:
         """Machine, process and GPUs of this process."""
-        import ray
-
-        gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-        return Node(ray.get_runtime_context().get_node_id(), socket.gethostname(), os.getpid(), gpus)
+        return Node("", socket.gethostname(), os.getpid(), os.environ.get("CUDA_VISIBLE_DEVICES", ""))
 
     def open(
         self, options: RunOptions, folder: str, cores: tuple[int, int], factories: Factories | None
@@ -58,6 +53,7 @@ class EpisodeActor:
         usable, (first, number) = sorted(os.sched_getaffinity(0)), cores
         if first + number <= len(usable):  # otherwise the cluster counts more cores than there are, or it has them
             os.sched_setaffinity(0, usable[first : first + number])
+        os.environ.setdefault("OMP_NUM_THREADS", str(number))
         self._folder = Path(folder)
         return self._thread.submit(self._open, options, factories).result()
 
