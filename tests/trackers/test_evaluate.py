@@ -14,7 +14,7 @@ from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
 from arena_newton.robot import g1
 from arena_newton.trackers.evaluate import main
-from arena_newton.trackers.evaluation import chart
+from arena_newton.trackers.evaluation import chart, tracker_film
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
@@ -452,7 +452,6 @@ def test_film_shows_the_robot(tmp_path, monkeypatch):
     from PIL import Image
 
     from arena_newton.trackers.base import get
-    from arena_newton.trackers.evaluation import tracker_film
 
     for name, value in (("FILMED", {"squat 0.45": "squat"}), ("PICTURES", 2), ("WIDTH", 48), ("HEIGHT", 48)):
         monkeypatch.setattr(tracker_film, name, value)
