@@ -35,7 +35,7 @@ def test_three_starts_with_two_caches(monkeypatch):
     figures = list(bench_start.start_figures())
     caches = [cache for cache, _ in calls]
     assert caches[0] == caches[1] != caches[2] and calls[2][1].endswith(", 1)") and calls[0][1].endswith(", 0)")
-    assert [figure.bar for figure in figures] == [40.0, 8.0]
+    assert [figure.bar for figure in figures] == [70.0, 8.0]
     assert torch.cuda.is_available() or [figure.value for figure in figures] == [None, None]
     for figure in figures:  # what comes before the environment is said, but not judged
         assert "environment 2.0 s" in figure.note and "not in the figure: interpreter and libraries" in figure.note
