@@ -85,7 +85,11 @@ class CellPlayer:
         if self.options.limit is not None:
             todo = todo[: self.options.limit]
         self._measure_before(cells)
-        if not self.play_cells(todo):
+        try:
+            whole = self.play_cells(todo)
+        except KeyboardInterrupt:  # as a cell begins or ends
+            whole = False
+        if not whole:
             print(f"\ninterrupted; {self._kept(chosen)}; continue with: {self.again}", flush=True)
             return 130
         return self._end(chosen)

@@ -12,6 +12,7 @@ from eval_fakes import FakeEnv, FakePolicy, factories
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.suites import suite_run
 from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_only, run_options, selected
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
 from arena_newton.eval.suites.suite_records import load_cell, read_events, read_suite
@@ -169,6 +170,13 @@ def test_interrupt_says_how_to_go_on(suite, tmp_path, capsys):
     assert f"--out '{out}' --only task=boxing" in output and "0 of 3 cells done" in output
     assert "Traceback" not in complaint
     assert read_suite(out).cells[0].status == "started"
+
+
+def test_an_interrupt_as_a_cell_begins_says_it_too(suite, tmp_path, capsys, monkeypatch):
+    """Ctrl-C after a cell was named and before anything of it is played."""
+    monkeypatch.setattr(suite_run.CellPlayer, "begun", lambda *_: signal.raise_signal(signal.SIGINT))
+    assert call(suite, tmp_path / "out") == 130
+    assert "cells done; continue with: python -m arena_newton.eval matrix" in capsys.readouterr().out
 
 
 class Killed(BaseException):
