@@ -59,7 +59,7 @@ class Child:
         return self.printed()[0].splitlines()
 
     def printed(self):
-        """What it has printed so far, and its complaints."""
+        """Text that it has printed so far, and its complaints."""
         return tuple(Path(self._printed.name, name).read_bytes().decode() for name in ("out", "err"))
 
     def send_signal(self, number):

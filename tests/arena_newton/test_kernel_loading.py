@@ -50,7 +50,7 @@ LIBRARIES = ("newton._src.", "mujoco_warp._src.")
 @pytest.mark.release
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_the_lists_are_what_an_environment_launches(engine):
-    """Where nothing is loaded ahead a process launches every listed module, and of Newton and MuJoCo Warp no other."""
+    """A process that loads nothing ahead launches every listed module, and of Newton and MuJoCo Warp no other."""
     done = subprocess.run([sys.executable, "-c", SCRIPT, engine], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     loaded = set(json.loads(done.stdout.splitlines()[-1]))

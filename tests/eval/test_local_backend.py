@@ -94,7 +94,7 @@ def ended(pid):
 
 
 def test_processes_end_with_who_started_them():
-    """Whatever ends the run, even `kill -9`, none of its processes stays."""
+    """None of its processes stays when a run ends, even by `kill -9`."""
     program = subprocess.Popen([sys.executable, "-c", STARTS], stdout=subprocess.PIPE, text=True)
     pid = int(program.stdout.readline())
     assert not ended(pid)

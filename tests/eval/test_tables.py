@@ -67,7 +67,7 @@ def test_what_is_missing_is_said(tmp_path):
 
 @pytest.mark.parametrize("mode", ["base", "semantic"])
 def test_semantic_numbers_say_what_they_are(tmp_path, capsys, mode):
-    """Where numbers of semantic mode are, it is said what that changes and who chose its strength; elsewhere not."""
+    """Numbers of semantic mode stand beside what it changes and who chose its strength; others do not."""
     a, b = tmp_path / "a", tmp_path / "b"
     for folder in (a, b):
         rows = [row | {"mode": mode, "privileged": True} for row in episodes("football", (4, 5, 7))]

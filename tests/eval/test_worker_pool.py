@@ -240,7 +240,7 @@ def test_other_code_or_versions_are_refused(pool_of):
 
 
 def test_the_driver_loads_no_physics():
-    """What deals episodes out runs on a machine without GPU or simulator: neither torch nor Warp is imported.
+    """A process that deals episodes out needs no GPU or simulator: neither torch nor Warp is imported.
 
     A process that plays begins alike, so that its cores and GPU are settled before they load.
     """
