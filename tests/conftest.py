@@ -15,7 +15,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-import benchmarks  # noqa: E402, F401  before the package takes the root of a checkout off the path
+# Before the package takes the root of a checkout off the path.
+import benchmarks  # noqa: E402, F401
+import scene_builders  # noqa: E402, F401
 
 sys.path.remove(str(ROOT))
 SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))

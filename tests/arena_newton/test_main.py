@@ -27,7 +27,6 @@ def test_every_program_of_the_package_has_a_command():
         "eval/workers/local_backend.py",
         "policies/train/frames/decoder_process.py",
         "trackers/__main__.py",
-        "usd_scenes/g1/build.py",
     }
     programs = set()
     for folder in ("arena_newton", "kernels", "trackers", "policies", "eval", "usd_scenes"):
