@@ -25,6 +25,17 @@ def cells(made_suite):
     return read_cells([made_suite])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_strips():
+    """Pictures of film strips have a sixteenth of their pixels."""
+    from arena_newton.pictures.settings import STRIP_SIZES
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, size in STRIP_SIZES.items():
+            patch.setitem(STRIP_SIZES, name, tuple(side // 8 * 2 for side in size))
+        yield
+
+
 @pytest.fixture(scope="module")
 def narrow():
     """Vision encoders of packed policies have a quarter of their channels, whose numbers it gives."""

@@ -133,7 +133,7 @@ def test_a_killed_encoder_stops_the_run(brief, tmp_path, parts, monkeypatch, cap
     def kill(self, *pictures):
         add(self, *pictures)
         frames.append(1)
-        if len(frames) == 20:
+        if len(frames) == 10:
             started[0].kill()
 
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
@@ -176,7 +176,7 @@ def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, parts, monkeypatch, capsy
 
     def interrupt(self, *pictures):
         rendered.append(1)
-        if len(rendered) == 25:
+        if len(rendered) == 12:
             assert list(folder.glob("episodes/**/*.part"))
             signal.raise_signal(signal.SIGINT)
         return render(self, *pictures)

@@ -87,12 +87,12 @@ def test_another_motion_is_an_error_that_names_the_tick(bare, tmp_path, capsys, 
     """A changed action makes another motion: exit code 1 with the first tick at which a position differs."""
     source = EpisodeFile(episode_files([bare])[0])
     actions = source.array("arena_executed_action").copy()
-    actions[10, 9] += 0.3
+    actions[4, 9] += 0.3
     folder = changed(bare, tmp_path / "changed", arena_executed_action=actions)
     out = tmp_path / "out"
     assert main(["record", "--from", str(folder), "--size", "64x48", "--out", str(out)], parts) == 1
     said = capsys.readouterr().err
-    assert "arena_qpos: at tick 11 " in said and source.stem in said
+    assert "arena_qpos: at tick 5 " in said and source.stem in said
     assert not list(out.rglob("*.npz")) and not list(out.rglob("*.part")) and not list(out.rglob("*.mp4"))
 
 

@@ -17,6 +17,11 @@ SIZE = (80, 48)
 """Width and height of the test's videos [px]."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_strips():
+    """Strips of the usual size, from which pictures are cut."""
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A run of three tasks whose first success is repeat 1, with a video and a strip of one colour each."""

