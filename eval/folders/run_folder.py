@@ -20,9 +20,9 @@ from arena_newton.eval.records import document as documents
 from arena_newton.eval.records.document import CONFIG_FILE, Document, read_document
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import JsonObject, check_types
 from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import plain_text
 
 __all__ = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,8 @@ from lerobot.configs import parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
+from arena_newton.files.stored_json import read_object
 from arena_newton.pictures.settings import Fit, robot_fit
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
@@ -65,7 +66,7 @@ def policy_worlds() -> PolicyWorlds:
     if not (Path(given) / CONFIG_FILE).is_file():
         return PolicyWorlds()
     path = Path(given) / CONFIG_FILE
-    content = _config(path)
+    content = read_object(path, MAX_CONFIG_BYTES)
     facts, ticks = CheckpointFacts.read(path.parent), _look_ticks(path, content)
     if facts is None:
         width, height = _picture(path, content)
@@ -82,16 +83,6 @@ def policy_worlds() -> PolicyWorlds:
         fit=camera.fit,
         source=path.with_name(FACTS_FILE),
     )
-
-
-def _config(path: Path) -> Mapping[str, object]:
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
-    return content
 
 
 def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:

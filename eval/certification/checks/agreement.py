@@ -20,9 +20,9 @@ from arena_newton.eval.certification.finding import (
     score,
     skipped,
 )
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import mcnemar
 from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
 

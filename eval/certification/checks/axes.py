@@ -15,7 +15,7 @@ from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.checks.traces import first_difference, play, world_of
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, score, skipped
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig

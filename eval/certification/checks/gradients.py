@@ -28,7 +28,7 @@ from arena_newton.tasks.judge import Judge
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json, JsonObject
+    from arena_newton.files.stored_json import Json, JsonObject
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight_slopes"]

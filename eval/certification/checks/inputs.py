@@ -18,7 +18,7 @@ from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import check_parts
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 from arena_newton.interfaces import Chunk, Observation, Tracker
 from arena_newton.pages.tables import Table

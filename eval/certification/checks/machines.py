@@ -22,10 +22,10 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
-from arena_newton.eval.records.schema import Json, JsonObject
 from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
+from arena_newton.files.stored_json import Json, JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
 

@@ -21,8 +21,8 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.identity import config_hash
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.own_files import file_label
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.files.untrusted_files import read_arrays
 from arena_newton.pages.tables import Table

@@ -23,7 +23,7 @@ from arena_newton.rollout import Rollout
 from arena_newton.tasks import boxing, double_desk, football, open_door, pp_box, vis_navi
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
     from arena_newton.tasks.handles import BodyFrame, Marker
 

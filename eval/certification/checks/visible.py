@@ -13,7 +13,7 @@ from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.kernels.tick import RUNNING
 from arena_newton.pages.tables import Table
