@@ -17,13 +17,13 @@ from arena_newton.cli.flags import parse_flags
 from arena_newton.errors import InputError
 from arena_newton.tasks.base import SCENES
 
-__all__ = ["SceneOptions", "build_all", "main", "parts"]
+__all__ = ["LayerOptions", "build_all", "main", "parts"]
 
 PROG = "python -m scene_builders"
 
 
 @dataclass(frozen=True)
-class SceneOptions:
+class LayerOptions:
     """Write the layers of `usd_scenes` from their builders."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Write and print the paths; 0 when all is written, 2 for an unknown part or a folder that cannot be written."""
 
     def work() -> int:
-        options = parse_flags(SceneOptions, list(sys.argv[1:] if argv is None else argv), PROG)
+        options = parse_flags(LayerOptions, list(sys.argv[1:] if argv is None else argv), PROG)
         try:
             print(*build_all(options.out, options.names), sep="\n")
         except OSError as error:

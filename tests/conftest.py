@@ -1,4 +1,4 @@
-"""What all tests share: reference material, scenes that are built once per session, and a small heap to collect."""
+"""Fixtures of all tests: reference material, scenes that are built once per session, and a small heap to collect."""
 
 import gc
 import os
@@ -60,14 +60,6 @@ def shared() -> Path:
     if not (SHARED / "reference").is_dir():
         pytest.skip(f"needs reference material, and {SHARED} has none; ARENA_REFERENCE names another folder")
     return SHARED
-
-
-@pytest.fixture(scope="session", autouse=True)
-def power():
-    """No test takes it away: nobody waits for a disk, which takes milliseconds a line of a journal."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: None)
-        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

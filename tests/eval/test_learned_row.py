@@ -90,18 +90,19 @@ def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
     assert results["config"]["policy_facts"]["weights"] == read_card(shipped).weights and results["complete"]
 
 
-def test_a_learned_run_that_was_interrupted_is_resumed(shipped, tmp_path, capsys):
+def test_a_learned_run_that_was_interrupted_is_resumed(shipped, tmp_path, capsys, monkeypatch):
     """Ctrl-C in the second run keeps the experts' report; the second goes on by its own resume."""
+    act = FakePolicy.act
 
-    class Interrupting(FakePolicy):
-        def act(self, observation):
+    def interrupted(self, observation):
+        if self.name == "learned":
             raise KeyboardInterrupt
-
-    def policy(spec, **options):
-        return Interrupting(spec, **options) if spec == "learned" else FakePolicy(spec, **options)
+        return act(self, observation)
 
     out = tmp_path / "out"
-    assert main(["--device", "cpu", "--out", str(out)], factories(policy=policy)) == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(FakePolicy, "act", interrupted)
+        assert main(["--device", "cpu", "--out", str(out)], factories()) == 130
     printed = capsys.readouterr().out
     assert rows(printed)[0][2] == "expert" and f"resume {out / 'learned'}" in printed
     assert main(["resume", str(out / "learned")], factories()) == 0
