@@ -192,11 +192,8 @@ def tester(hint: object) -> Callable[[Json], bool]:
         return lambda v: isinstance(v, dict) and all(key(k) and value(x) for k, x in v.items())
     if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or typing.is_typeddict(hint)):
         tests, required = {key: test for key, (test, _) in _fields(hint).items()}, _required(hint)
-        more = typing.is_typeddict(hint)
         return lambda v: (
-            isinstance(v, dict)
-            and required <= set(v)
-            and all(tests[k](x) if k in tests else more for k, x in v.items())
+            isinstance(v, dict) and required <= set(v) and all(tests[k](x) for k, x in v.items() if k in tests)
         )
     return _PLAIN[hint]
 
@@ -225,6 +222,8 @@ def _expected(hint: object) -> str:
         return f"expected {' '.join(parts)}"
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         return " or ".join([_expected(parts[0]), *(_expected(part).removeprefix("expected ") for part in parts[1:])])
+    if dataclasses.is_dataclass(hint):
+        return "expected an object"
     words = {str: "text", bool: "true or false", int: "a number", float: "a number", types.NoneType: "null"}
     return f"expected {words.get(hint, 'values of other types')}"  # type: ignore[call-overload]
 
@@ -301,7 +300,7 @@ def _maker(hint: object) -> Callable[[Json], object] | None:
 
 def shown(value: Json) -> str:
     """A stored value for a message."""
-    return plain_text(json.dumps(value, ensure_ascii=True), 60)
+    return plain_text(json.dumps(value, ensure_ascii=True, default=str), 60)
 
 
 def check_types(where: str, values: Mapping[str, Json], kind: type) -> JsonObject:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -45,13 +46,9 @@ def visual(context: Context) -> CheckFinding:
     tracker, rows, broken, pictures = context.trackers[0], [], [], []
     for task in context.tasks:
         seeds, picture = context.seeds(task, number), context.folder / "pictures" / f"visual_{task}.png"
-
-        def measure(task: str = task, seeds: list[int] = seeds, picture: Path = picture) -> JsonObject:
-            return _compare_modes(context, task, tracker, seeds, ticks, picture)
-
+        measure = functools.partial(_compare_modes, context, task, tracker, seeds, ticks, picture)
         settings: JsonObject = {"seeds": list(seeds), "ticks": ticks}
         found = context.measured("visual", task, tracker, settings, measure)
-        assert isinstance(found, dict)
         compared, differs, changed = int(found["ticks"]), found["differs"], float(found["changed"])
         rows.append(
             (task, str(len(seeds)), f"{compared:,}", "none" if differs is None else str(differs), f"{changed:.1f}")

@@ -111,7 +111,6 @@ def shards(context: Context) -> CheckFinding:
             return compared(alone, Path(kept) / "merged")
 
     found = context.measured("shards", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if "refused" in found:
         return CheckFinding("fail", f"shards are not merged: {found['refused']}")
     verdict, said, wrong = _judged(found, f"{SHARDS} merged shards")
@@ -138,7 +137,6 @@ def ray(context: Context) -> CheckFinding:
         return facts | (compared(alone, folder) if run.code in (0, 1) else {})
 
     found = context.measured("ray", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if found["code"] not in (0, 1):
         how = f"took longer than {RAY_MINUTES:g} min" if found["code"] is None else f"ended with code {found['code']}"
         return CheckFinding("fail", f"a run by a Ray cluster {how}: {found['said']}")

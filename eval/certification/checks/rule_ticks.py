@@ -183,7 +183,7 @@ def rules(context: Context) -> CheckFinding:
             env.close()
             return {"found": [list(pair) for pair in ticks.found]}
 
-        found = cast("JsonObject", context.measured("rules", task, tracker, {"seeds": list(seeds)}, measure))["found"]
+        found = context.measured("rules", task, tracker, {"seeds": list(seeds)}, measure)["found"]
         for held, judged in found:
             told = [("none" if tick is None else str(tick)) for tick in (held, judged)]
             rows.append((task, str(RULES[task][1]), *told))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -51,12 +52,8 @@ def visible(context: Context) -> CheckFinding:
             missing.append(f"{task}: no target is named for it")
             continue
         picture = context.folder / "pictures" / f"visible_{task}.png"
-
-        def measure(task: str = task, picture: Path = picture) -> JsonObject:
-            return _look(context, task, tracker, picture)
-
+        measure = functools.partial(_look, context, task, tracker, picture)
         found = context.measured("visible", task, tracker, {"episodes": context.episodes}, measure)
-        assert isinstance(found, dict)
         sights, pixels = list(found["first"]), list(found["pixels"])
         seen = sorted(int(tick) for tick in sights if tick is not None)
         at_once = seen.count(0)
