@@ -24,10 +24,13 @@ __all__ = [
     "check_numbers",
     "check_ranges",
     "check_teachable",
+    "task_weights",
 ]
 
 UNCOMPILED = ("pi05",)
 """Families that --compile refuses."""
+BALANCES = ("picture", "task")
+"""Draws of the samples."""
 
 
 def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
@@ -59,8 +62,16 @@ class PolicyTrainOptions:
     labels: str = ""
     """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
     in memory."""
+    balance: str = "picture"
+    """Draw of the samples: picture (every picture equally often), task (first a task and tracker, then a picture)."""
+    task_weights: Several[str] = ()
+    """Weights of tasks in the draw of --balance task, as boxing=1.5 double_desk=2; 1 of those that are not named."""
+    picture_every: int = field(default=1, metadata=bounds(1, 1000))
+    """Ticks from one picture of an episode that is loaded, and that a sample begins at, to the next."""
     task_vector: bool = False
     """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
+    tracker_vector: bool = True
+    """Name in that vector the tracker too, where the datasets were recorded through several."""
     batch_size: int = field(default=0, metadata=bounds(0, 65536))
     """Samples of a step, of each process; 0: the recipe's."""
     lr: float = field(default=0.0, metadata=bounds(0.0, 1.0))
@@ -158,6 +169,24 @@ def check_ranges(options: DataclassInstance) -> None:
                 raise InputError(f"{flag} {value}: expected a number {until}")
 
 
+def task_weights(given: Sequence[str]) -> dict[str, float]:
+    """Weights of tasks as they are typed.
+
+    Raises:
+        InputError: One is no name and positive number.
+    """
+    found: dict[str, float] = {}
+    for text in given:
+        task, _, number = text.partition("=")
+        try:
+            found[task] = float(number)
+        except ValueError:
+            found[task] = math.nan
+        if not task or not 0.0 < found[task] < math.inf:
+            raise InputError(f"--task-weights {text}: expected a task and a positive number, as boxing=1.5")
+    return found
+
+
 def check_choices(policy: str, recipe: str, datasets: Sequence[Path], *, compiled: bool) -> None:
     """Refuse a family, recipe or datasets that no training can use, before anything is loaded.
 
@@ -192,6 +221,10 @@ def check_numbers(options: PolicyTrainOptions) -> None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.labels not in ("", "v3.1", "v4"):
         raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    if options.balance not in BALANCES:
+        raise InputError(f"--balance {options.balance}: unknown, choose from {', '.join(BALANCES)}")
+    if task_weights(options.task_weights) and options.balance != "task":
+        raise InputError("--task-weights: weigh the draw of --balance task, which is not given")
     if options.resume is None and not options.dataset:
         raise InputError("--dataset: name at least one folder of a dataset")
     if options.resume is not None and not options.resume.is_dir():

@@ -15,7 +15,13 @@ __all__ = ["gathered_pictures"]
 
 
 def gathered_pictures(
-    store: FrameStore, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+    store: FrameStore,
+    rows: torch.Tensor,
+    *,
+    tall: int = 0,
+    shift: int = 0,
+    colour: float = 0.0,
+    transforms: bool = False,
 ) -> torch.Tensor:
     """Pictures of rows, whole again and on the scale 0 to 1.
 
@@ -25,31 +31,34 @@ def gathered_pictures(
     Args:
         store: All pictures.
         rows: Rows of the samples, int64, shape [B].
+        tall: Height of the pictures that are wanted, cut about the middle of the camera's [px]; 0: its own.
         shift: Most pixels by which a picture is shifted in each direction.
         colour: Most relative change of the brightness, and of each colour on top.
         transforms: Apply LeRobot's image transforms, to the whole picture as LeRobot does.
 
     Returns:
-        float32, shape [B, 3, height, width].
+        float32, shape [B, 3, tall, width].
     """
-    batch, device = len(rows), store.device
-    height, width = int(store.pictures.shape[1]), int(store.pictures.shape[2])
+    batch, device, tall = len(rows), store.device, tall or store.height
+    stored, above = store.middle(tall)
+    height, width = int(stored.shape[1]), int(stored.shape[2])
+    numbers = store.picture[rows]
     if shift:
         moved = torch.randint(-shift, shift + 1, (2, batch, 1), device=device)
         down = (torch.arange(height, device=device) + moved[0]).clamp_(0, height - 1)
         right = (torch.arange(width, device=device) + moved[1]).clamp_(0, width - 1)
-        seen = store.pictures[rows[:, None, None], down[:, :, None], right[:, None, :]]
+        seen = stored[numbers[:, None, None], down[:, :, None], right[:, None, :]]
     else:
-        seen = store.pictures[rows]
+        seen = stored[numbers]
     pictures = seen.permute(0, 3, 1, 2).float().div_(255.0)
     if colour:
         change = torch.rand((batch, 4, 1, 1), device=device).mul_(2.0 * colour).add_(1.0 - colour)
         pictures = pictures.mul_(change[:, :1] * change[:, 1:]).clamp_(0.0, 1.0)
-    if store.top or store.bottom:
+    if height < tall:
         # Channels last, as the pictures are stored and as a GPU's convolutions read them.
-        whole = pictures.new_zeros((batch, store.height, width, 3)).permute(0, 3, 1, 2)
-        whole[:, :, store.top : store.top + height] = pictures
+        whole = pictures.new_zeros((batch, tall, width, 3)).permute(0, 3, 1, 2)
+        whole[:, :, above : above + height] = pictures
         pictures = whole
     if transforms:
-        pictures = transformed(pictures, drawn_transforms(batch, store.height, width, device))
+        pictures = transformed(pictures, drawn_transforms(batch, tall, width, device))
     return pictures
