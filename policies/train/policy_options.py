@@ -24,6 +24,7 @@ __all__ = [
     "check_numbers",
     "check_ranges",
     "check_teachable",
+    "look_fractions",
 ]
 
 UNCOMPILED = ("pi05",)
@@ -59,6 +60,9 @@ class PolicyTrainOptions:
     labels: str = ""
     """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
     in memory."""
+    looks: Several[str] = ()
+    """Fraction of the samples whose looks are changed, and that of single tasks, as 0.6 double_desk=0.3; of datasets
+    that were recorded with `eval record --looks`."""
     task_vector: bool = False
     """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
     batch_size: int = field(default=0, metadata=bounds(0, 65536))
@@ -180,6 +184,24 @@ def check_choices(policy: str, recipe: str, datasets: Sequence[Path], *, compile
             raise InputError(f"--dataset {datasets[number]}: is named twice")
 
 
+def look_fractions(given: Sequence[str]) -> tuple[float, dict[str, float]]:
+    """Fraction of the samples whose looks are changed, and that of single tasks, as they are typed.
+
+    Raises:
+        InputError: One is no fraction.
+    """
+    found: dict[str, float] = {}
+    for text in given:
+        task, _, number = text.rpartition("=")
+        try:
+            found[task] = float(number)
+        except ValueError:
+            found[task] = math.nan
+        if not 0.0 <= found[task] <= 1.0:
+            raise InputError(f"--looks {text}: expected a fraction from 0 to 1, of one task as double_desk=0.3")
+    return found.pop("", 0.0), found
+
+
 def check_numbers(options: PolicyTrainOptions) -> None:
     """Refuse flags that no training can use, before anything is loaded.
 
@@ -192,6 +214,7 @@ def check_numbers(options: PolicyTrainOptions) -> None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.labels not in ("", "v3.1", "v4"):
         raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    look_fractions(options.looks)
     if options.resume is None and not options.dataset:
         raise InputError("--dataset: name at least one folder of a dataset")
     if options.resume is not None and not options.resume.is_dir():

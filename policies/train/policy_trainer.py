@@ -158,7 +158,7 @@ class PolicyTrainer:
         """Batch, loss and gradient."""
         recipe = self.recipe
         batch = self.batches(
-            self._rows, shift=recipe.shift_px, colour=recipe.colour, transforms=recipe.image_transforms
+            self._rows, looks=True, shift=recipe.shift_px, colour=recipe.colour, transforms=recipe.image_transforms
         )
         # LeRobot makes some constants on the host and copies them, which no graph can hold; here they are made on the
         # device.

@@ -86,7 +86,13 @@ class BatchMaker:
         self._vectors = torch.eye(max(1, len(self.task_vector)), device=device)[torch.tensor(numbers, device=device)]
 
     def __call__(
-        self, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+        self,
+        rows: torch.Tensor,
+        *,
+        looks: bool = False,
+        shift: int = 0,
+        colour: float = 0.0,
+        transforms: bool = False,
     ) -> dict[str, torch.Tensor]:
         """The batch of rows.
 
@@ -94,6 +100,7 @@ class BatchMaker:
 
         Args:
             rows: int64, shape [B].
+            looks: Change the looks of a part of the samples, which may then begin a few rows earlier.
             shift: Most pixels by which a picture is shifted.
             colour: Most relative change of brightness and colours.
             transforms: Apply LeRobot's image transforms.
@@ -102,11 +109,15 @@ class BatchMaker:
             `observation.images.front` [B, 3, H, W], `observation.state` [B, 64], `action` [B, n, 40], `action_is_pad`
             bool [B, n]; the task vector and tokens of language where the policy takes them.
         """
-        store = self.store
+        store, changed = self.store, None
+        if looks and store.looks is not None:
+            rows, changed = store.looks.chosen(rows)
         wanted = rows[:, None] + self._offsets
         inside = torch.minimum(torch.maximum(wanted, store.first[rows][:, None]), store.last[rows][:, None])
         batch = {
-            CAMERA_KEY: gathered_pictures(store, rows, shift=shift, colour=colour, transforms=transforms),
+            CAMERA_KEY: gathered_pictures(
+                store, rows, changed=changed, shift=shift, colour=colour, transforms=transforms
+            ),
             STATE_KEY: store.states[rows],
             ACTION_KEY: store.actions[inside],
         }

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ from arena_newton.policies.train.frames.demonstration_rows import (
     EpisodeRows,
 )
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
+
+if TYPE_CHECKING:
+    from arena_newton.policies.train.frames.look_store import LookStore
 
 __all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
 
@@ -64,6 +68,8 @@ class FrameStore:
     """Black rows above [px]."""
     bottom: int
     """Black rows below [px]."""
+    looks: LookStore | None = None
+    """Looks of the pictures, where a training changes them."""
 
     @property
     def device(self) -> torch.device:
