@@ -256,7 +256,8 @@ def _play(door: str, options: DoorOptions, checkpoint: Path, folder: Path) -> Do
             spec = f"{door}:{checkpoint}"
             if door in SERVED:
                 served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", door]
-                served += ["--port", "0", "--task", options.task, "--device", options.device]
+                served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
+                served += ["--device", options.device]
                 commands.append([sys.executable, "-m", *served])
                 spec = stack.enter_context(_server(door, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))

@@ -199,7 +199,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     """Sizes of the network; whatever it would need besides is refused."""
     expected: dict[str, list[int]] = {FRONT: [3, facts.height, facts.width], STATE: [STATE_WIDTH]}
     if facts.task_vector:
-        expected[TASK_VECTOR] = [len(facts.task_vector)]
+        expected[TASK_VECTOR] = [facts.vector_width]
     for field, wanted in (("input_features", expected), ("output_features", {"action": [ACTION_WIDTH]})):
         given = _object(path, field, config.get(field))
         shapes = {name: _object(path, f"{field}.{name}", one).get("shape") for name, one in given.items()}
@@ -225,7 +225,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     if numbers["dim_model"] % numbers["n_heads"] or numbers["dim_model"] % 4:
         raise InputError(f"{path}: dim_model is {numbers['dim_model']}, expected a multiple of n_heads and of 4")
     words = {one.name: config[one.name] for one in fields(ActSizes) if one.name in refused}
-    return ActSizes(state=STATE_WIDTH, tasks=len(facts.task_vector), actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
+    return ActSizes(state=STATE_WIDTH, tasks=facts.vector_width, actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
 
 
 def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str]]:

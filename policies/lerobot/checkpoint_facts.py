@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from arena_newton.files.own_files import replace_atomically
 from arena_newton.files.text import plain_text
 from arena_newton.pictures.settings import CameraConfig
 
-__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
+__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder", "vector_of"]
 
 FACTS_FILE = "arena_policy.json"
 """File of a checkpoint that holds its `CheckpointFacts`."""
@@ -51,6 +51,9 @@ class CheckpointFacts:
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given as `observation.environment_state`; none: it
     is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow those of the tasks, and one more for any other tracker; none:
+    the vector says nothing of the tracker."""
     family: str = ""
     """`act`, `diffusion`, `flow`, `pi05`."""
     recipe: str = ""
@@ -70,6 +73,15 @@ class CheckpointFacts:
     """Of each dataset: `name`, `hash` of its content, `episodes`, `frames`."""
     options: Mapping[str, object] = field(default_factory=dict)
     """The training's resolved options."""
+
+    @property
+    def vector_width(self) -> int:
+        """Numbers of the vector of task and tracker; 0: the policy is given none."""
+        return len(self.vector("", ""))
+
+    def vector(self, task: str, tracker: str) -> list[float]:
+        """The vector of a task and a tracker."""
+        return vector_of(self.task_vector, self.tracker_vector, task, tracker)
 
     @property
     def camera(self) -> CameraConfig:
@@ -103,9 +115,11 @@ class CheckpointFacts:
             if one.name in content:
                 values[one.name] = _checked(path, one.name, one.default, content[one.name])
         facts = cls(**values)  # type: ignore[arg-type]  # each is of its default's kind
-        if len(set(facts.task_vector)) < len(facts.task_vector):
-            raise InputError(f"{path}: task_vector names a task twice")
-        for key in ("task_vector", "tasks", "trackers"):
+        if facts.tracker_vector and not facts.task_vector:
+            raise InputError(f"{path}: tracker_vector is given without a task_vector, which it is a part of")
+        for key in ("task_vector", "tracker_vector", "tasks", "trackers"):
+            if key.endswith("vector") and len(set(getattr(facts, key))) < len(getattr(facts, key)):
+                raise InputError(f"{path}: {key} names a {key.removesuffix('_vector')} twice")
             for name in getattr(facts, key):
                 if not _NAME.fullmatch(name):
                     raise InputError(f"{path}: {key} holds {plain_text(name, 60)!r}, which is no name")
@@ -120,6 +134,21 @@ class CheckpointFacts:
         except InputError:
             raise InputError(f"{path}: labels is {facts.labels!r}, a protocol that is not known") from None
         return facts
+
+
+def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker: str) -> list[float]:
+    """One-hot numbers of a task, then, where trackers are named, of a tracker.
+
+    Args:
+        tasks: In the order of their numbers.
+        trackers: In the order of their numbers, after which one more is that of any other tracker.
+        task: Name.
+        tracker: Name; empty: not known.
+    """
+    told = [float(name == task) for name in tasks]
+    if trackers:
+        told += [float(name == tracker) for name in trackers] + [float(tracker not in trackers)]
+    return told
 
 
 def _checked(path: Path, name: str, default: object, value: object) -> object:

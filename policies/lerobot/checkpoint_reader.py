@@ -298,12 +298,13 @@ def _features(
         if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
             picture = (int(shape[1]), int(shape[2]))
             continue
-        if given == TASK_VECTOR and facts.task_vector and shape == (len(facts.task_vector),):
+        if given == TASK_VECTOR and facts.task_vector and shape == (facts.vector_width,):
             continue
         if name.startswith("observation.images.empty_camera_") and config.type == "pi05":
             continue  # the network fills it with an empty picture itself
         if given == TASK_VECTOR:
-            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks for it"
+            trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
+            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
             raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
         known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")

@@ -28,6 +28,8 @@ class PolicyWorlds:
     """Of v4: ticks between two looks of the policy, at which the heading is measured."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given; none: it is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow, as of `CheckpointFacts`."""
     width: int = 224
     """Width of its pictures [px]."""
     height: int = 224
@@ -43,8 +45,9 @@ class PolicyWorlds:
         flags = {"labels": self.labels, "image_width": self.width, "image_height": self.height, "fit": self.fit}
         if self.labels == "v4":
             flags |= {"realign": self.realign, "look_ticks": self.look_ticks}
-        if self.task_vector:
-            flags["task_vector"] = ",".join(self.task_vector)
+        for name in ("task_vector", "tracker_vector"):
+            if getattr(self, name):
+                flags[name] = ",".join(getattr(self, name))
         return " ".join(f"--env.{name}={value}" for name, value in flags.items())
 
 
@@ -77,6 +80,7 @@ def policy_worlds() -> PolicyWorlds:
         realign=facts.realign,
         look_ticks=ticks,
         task_vector=facts.task_vector,
+        tracker_vector=facts.tracker_vector,
         width=camera.width,
         height=camera.height,
         fit=camera.fit,

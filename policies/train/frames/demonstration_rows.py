@@ -34,7 +34,7 @@ STATE_KEY, ACTION_KEY = "observation.state", "action"
 CAMERA_KEY = "observation.images.front"
 """Name of the head camera's pictures."""
 VECTOR_KEY = "observation.environment_state"
-"""Name of the one-hot vector of tasks: LeRobot's networks take it as a token of its own."""
+"""Name of the one-hot vector of task and tracker: LeRobot's networks take it as a token of its own."""
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 """Those of a feature that normalization may use."""
 
@@ -50,6 +50,8 @@ class EpisodeRows:
     instruction: str
     task: str
     """Name of our task; empty where the dataset does not tell."""
+    tracker: str = ""
+    """Name of the tracker through which it was recorded; empty where the dataset does not tell."""
 
     @property
     def length(self) -> int:
@@ -135,7 +137,8 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
         task = seeds[row.index].task if seeds else about.task(row.index) or ""
         wanted = converted(actions[row.index], about.labels, labels)
         instruction = row.tasks[0] if row.tasks else ""
-        episodes.append(EpisodeRows(states[row.index], wanted, instruction, task))
+        tracker = seeds[row.index].tracker if seeds else ""
+        episodes.append(EpisodeRows(states[row.index], wanted, instruction, task, tracker))
     return DatasetRows(
         root=files.root,
         episodes=tuple(episodes),

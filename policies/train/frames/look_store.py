@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -89,14 +90,15 @@ def load_looks(
         for episode, film in zip(dataset.episodes, listed, strict=False):
             rows = np.arange(episode.length)
             if film is not None:
-                looks, frames = film.looks, film.looks.frames(episode.length)
-                mine = slice(row, row + episode.length)
-                number[mine], back[mine] = count + rows // looks.stride, rows % looks.stride
+                looks, mine = film.looks, slice(row, row + episode.length)
+                step = math.lcm(looks.stride, store.every)  # rows that have a picture too
+                frames = -(-episode.length // step)
+                number[mine], back[mine] = count + rows // step, rows % step
                 table[mine] = tables.setdefault(looks.shapes, len(tables) + 1)
                 if len(tables) == len(chances):
                     chances.append(looks.chances())
                     objects.append(looks.objects())
-                films.append(EpisodeFilm(dataset.root, film.episode, film.path, 0, frames, count))
+                films.append(EpisodeFilm(dataset.root, film.episode, film.path, 0, frames, count, step // looks.stride))
                 count += frames
             row += episode.length
     height, width, device = store.height, store.width, store.device
