@@ -43,7 +43,7 @@ EPISODES = "episodes"
 """Folder of the files of recorded episodes."""
 SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
 """Folders that a run writes inside its own."""
-RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
+RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth", "record_looks")
 """Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
 """File with the trace of a break, for a later look."""

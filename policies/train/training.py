@@ -23,9 +23,10 @@ from arena_newton.policies.train.families.policy_model import TrainableModel
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, task_weights
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_fractions, task_weights
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
@@ -114,6 +115,9 @@ def _train(
         store = load_frames(
             datasets, device, hold_out=options.hold_out, every=every, jobs=jobs, network=network, on_frames=bar.update
         )
+    if options.looks:
+        looks = load_looks(datasets, store, *look_fractions(options.looks), jobs=jobs, network=network)
+        store = dataclasses.replace(store, looks=looks)
     if speaks:
         size = store.pictures.numel() / 1e9
         print(

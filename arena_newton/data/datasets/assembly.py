@@ -18,6 +18,7 @@ import pyarrow.compute
 import pyarrow.parquet
 from tqdm import tqdm
 
+from arena_newton.data.datasets.look_films import write_looks
 from arena_newton.data.datasets.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import (
     DATA_PATH,
@@ -27,6 +28,7 @@ from arena_newton.data.readers.dataset_files import (
     VideoPart,
     read_json,
 )
+from arena_newton.data.readers.looks import Looks, dataset_looks
 from arena_newton.data.recording.layouts import REFERENCE_SOURCES
 from arena_newton.errors import InputError
 from arena_newton.files.limits import MIB
@@ -267,6 +269,12 @@ def write_selection(selections: Sequence[Selection], root: Path) -> None:
             pictures.close()
         av.logging.set_libav_level(av.logging.INFO)
     _write_meta(selections, root, info, rows, list(tasks), data.rows)
+    films: list[tuple[Looks, Path] | None] = []
+    for selection in selections:
+        known = dataset_looks(selection.files.root, selection.files.episodes)
+        chosen = (known[number] for number in selection.episodes)
+        films += [None if film is None else (film.looks, film.path) for film in chosen]
+    write_looks(root, films)
 
 
 def _size(info: Mapping[str, object], name: str, default: int) -> int:

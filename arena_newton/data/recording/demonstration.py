@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +16,10 @@ import torch
 import warp as wp
 
 from arena_newton.data.recording.encoding import Filming, FilmThreads, Pictured, Reel
-from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
+from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
 from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
 from arena_newton.data.recording.film_pool import FilmPool
+from arena_newton.data.recording.look_planes import LookPlanes
 from arena_newton.errors import ArenaError
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
@@ -28,6 +30,7 @@ from arena_newton.robot.rotations import matrix_from_quat, quat_apply, quat_conj
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
+    from arena_newton.data.readers.looks import Looks
     from arena_newton.interfaces import EpisodeResult, Observation, World
     from arena_newton.pictures.settings import CameraConfig
 
@@ -35,6 +38,8 @@ __all__ = ["DemonstrationRecorder", "RecordedEpisode", "SavedEpisode", "episode_
 
 FPS = round(1 / g1.TICK)
 """Frames per second: one a tick."""
+LOOKS = "looks"
+"""Name of the film of looks among those of the cameras; it is of the head camera's pictures."""
 WAITING_EPISODES = 8
 """Ended episodes whose files are not written yet, beside one per world: more of them wait for the disk."""
 
@@ -99,7 +104,8 @@ class _Stream:
     initial: dict[str, np.ndarray]
     """Fields of the reset."""
     reels: dict[str, Reel]
-    """Its films by camera."""
+    """Its films by camera, and that of its looks."""
+    looks: Looks | None = None
     heading: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     """Packed rows: the beginning of a tick, then what was executed in it."""
@@ -125,6 +131,7 @@ class DemonstrationRecorder(Recorder):
         *,
         cameras: Mapping[str, CameraConfig] | None = None,
         depth: bool = False,
+        looks: int = 0,
         seeds: str | None = None,
         only_success: bool = False,
         facts: Mapping[str, object] | None = None,
@@ -139,6 +146,7 @@ class DemonstrationRecorder(Recorder):
             folder: Where `<label>.npz` and `videos/` are written.
             cameras: Camera as datasets name it (`episode.CAMERAS`) → its picture; none: states and actions only.
             depth: Record the depth of each picture too, float16 [m].
+            looks: Second lights of an episode (`readers.looks`), with the camera `front`; 0: no looks.
             seeds: Range of the seeds, where the seed itself does not tell (`seeding.TELEOPERATION`).
             only_success: Write successes only.
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
@@ -149,6 +157,8 @@ class DemonstrationRecorder(Recorder):
             finishing: Makes the arrays that are written from those that were recorded.
         """
         self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
+        self.looks = looks
+        self._planes: LookPlanes | None = None
         self.seeds, self.only_success, self.finishing = seeds, only_success, finishing
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)
         self._env: World | None = None
@@ -178,11 +188,14 @@ class DemonstrationRecorder(Recorder):
         self._env = env
         self._described = env.describe()
         front = self.cameras.get("front")
-        # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
-        same = env.camera is not None and front == env.camera_config and not self.depth
+        # Surfaces of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
+        same = env.camera is not None and front == env.camera_config and not self.depth and not self.looks
         self._shared = "front" if same else None
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
         pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
+        if self.looks:
+            self._planes = LookPlanes(env, self._views["front"], self.looks)
+            pictured[LOOKS] = dataclasses.replace(pictured["front"], depth=False)
         self._filming.bind(pictured, torch.device(env.torch_device))
         scene = env.scene
         self._bodies = {}
@@ -240,7 +253,12 @@ class DemonstrationRecorder(Recorder):
             video = self.folder / VIDEO_FOLDER / f"{label}_{name}_rgb.mp4"
             depth = self.folder / f"{label}_{name}_depth.raw{PARTIAL}"
             reels[name] = self._filming.open(worker, video, depth, FPS)
-        self._streams[world] = _Stream(episode, worker, initial, reels)
+        looks = None
+        if self._planes is not None:
+            looks = self._planes.begin(world, episode.episode_seed)
+            film = looks_film(reels["front"].video)
+            reels[LOOKS] = self._filming.open(worker, film, film, FPS / looks.stride, lossless=True)
+        self._streams[world] = _Stream(episode, worker, initial, reels, looks)
         self._reels = {}
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
@@ -265,6 +283,8 @@ class DemonstrationRecorder(Recorder):
                 stream.heading = float(self._heading[world])
         for name, camera in self._views.items():
             self._film(env, name, camera, mask, observation)
+            if name == "front" and self._planes is not None:
+                self._film_looks(self._planes)
 
     def _act(self, worlds: list[int]) -> None:
         """Set the worlds that act in this tick; the choice of films follows only where it changes."""
@@ -284,6 +304,13 @@ class DemonstrationRecorder(Recorder):
         pictures = self._taken(wp.to_torch(camera.image))
         depths = self._taken(camera.distance_picture()).half() if self.depth else None
         self._filming.add(name, self._reels[name], pictures, depths)
+
+    def _film_looks(self, planes: LookPlanes) -> None:
+        """Hand over the looks of the pictures that the head camera has just rendered, where a frame is due."""
+        streams = {world: self._streams[world] for world in self._acting}
+        due = [w for w, stream in streams.items() if stream.looks and not len(stream.rows) % stream.looks.stride]
+        if due:
+            self._filming.add(LOOKS, [streams[world].reels[LOOKS] for world in due], planes.frames(due), None)
 
     def _taken(self, pictures: torch.Tensor) -> torch.Tensor:
         """Pictures of the worlds that act."""
@@ -440,8 +467,12 @@ class DemonstrationRecorder(Recorder):
         fields |= stream.initial
         fields["episode_object_seed"] = np.uint64(episode.object_seed)
         fields["episode_object_seed_source"] = np.str_("arena_episode_seed")
-        for name, film in films.items():
-            if film is not None:
+        looks = stream.looks
+        if looks is not None and (made := films.get(LOOKS)):
+            _check_frames(stream.reels[LOOKS], made, looks.frames(rows))
+            fields[f"arena_{vision('front', 'looks')}"] = np.str_(json.dumps(looks.plain()))
+        for name in self.cameras:
+            if (film := films[name]) is not None:
                 fields |= _film_fields(name, stream.reels[name], film, rows)
         fields |= {
             "arena_state": state,
@@ -475,7 +506,7 @@ class DemonstrationRecorder(Recorder):
         """Drop what is unfinished; no partial file stays."""
         self._discard()
         self._filming.close()
-        self._env, self._views = None, {}
+        self._env, self._views, self._planes = None, {}, None
 
     def _discard(self) -> None:
         self._filming.wait()
@@ -500,8 +531,7 @@ def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str,
     Raises:
         ArenaError: The film has another number of pictures.
     """
-    if film.frames != rows:
-        raise ArenaError(f"{reel.video}: {film.frames} frames for {rows} rows")
+    _check_frames(reel, film, rows)
     codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0, "mbtree": 0}
     found: dict[str, np.ndarray | np.generic] = {
         vision(name, "storage_format"): np.str_("video_v1"),
@@ -518,6 +548,11 @@ def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str,
         f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
         f"arena_{vision(name, 'histogram')}": film.histogram,
     }
+
+
+def _check_frames(reel: Reel, film: FilmFacts, frames: int) -> None:
+    if film.frames != frames:
+        raise ArenaError(f"{reel.video}: {film.frames} frames instead of {frames}")
 
 
 def _split(rows: Sequence[np.ndarray], widths: Sequence[int]) -> list[np.ndarray]:

@@ -110,8 +110,8 @@ class Filming(abc.ABC):
         """The episode brings no more pictures."""
 
     @abc.abstractmethod
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
-        """A film of an episode."""
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> Reel:
+        """A film of an episode; `lossless` keeps every byte of its pictures."""
 
     @abc.abstractmethod
     def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
@@ -305,10 +305,10 @@ class FilmThreads(Filming):
         """The episode brings no more pictures."""
         self._encoders.leave(worker)
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> Reel:
         """A film of an episode."""
         self._opened += 1
-        return Reel(self._opened, worker, video, depth, Film(video, depth, fps))
+        return Reel(self._opened, worker, video, depth, Film(video, depth, fps, lossless))
 
     def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
         """Append a picture to each film; waits while all slots are taken."""

@@ -163,10 +163,11 @@ class FilmPool(Filming):
         """The episode brings no more pictures."""
         self._open[worker] -= 1
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> Reel:
         """A film of an episode."""
         reel = Reel(next(self._numbers), worker, video, depth)
         about = {"film": reel.number, "video": str(video), "depth": str(depth), "fps": float(fps)}
+        about |= {"lossless": lossless}
         with self._whole:
             self._send(self._workers[worker], about)
         return reel

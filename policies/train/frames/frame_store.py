@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ from arena_newton.policies.train.frames.demonstration_rows import (
     EpisodeRows,
 )
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
+
+if TYPE_CHECKING:
+    from arena_newton.policies.train.frames.look_store import LookStore
 
 __all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
 
@@ -72,6 +76,8 @@ class FrameStore:
     """Black rows below [px]."""
     every: int = 1
     """Rows from one picture of an episode to the next; the first row has one."""
+    looks: LookStore | None = None
+    """Looks of the pictures, where a training changes them."""
 
     @property
     def device(self) -> torch.device:
