@@ -21,9 +21,9 @@ from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.policy_messages import Look
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION, STATE_WIDTH
 from benchmarks.bench_options import ServerBenchOptions
@@ -87,8 +87,10 @@ def _serve(protocol: str, clients: int, parent: Connection) -> None:
     """Serve until the parent says so; then answer with the largest memory [GiB]."""
     server = PolicyServer(StandingPolicy(), max_sessions=clients + 4)
     server.start()
-    door = open_door(server, ServeOptions(policy="stand", protocol=protocol, port=0), DoorGuard(clients + 8, ""))
-    parent.send(door.port)
+    endpoint = open_endpoint(
+        server, ServeOptions(policy="stand", protocol=protocol, port=0), ConnectionGuard(clients + 8, "")
+    )
+    parent.send(endpoint.port)
     parent.recv()
     status = Path("/proc/self/status").read_text()
     parent.send(next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 2**20)

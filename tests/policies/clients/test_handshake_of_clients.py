@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.policies.label_reader import V4Policy
 from arena_newton.policies.protocols.handshake import ServedPicture, read_facts
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.remote.address import DOORS, read_address
+from arena_newton.policies.remote.address import PREFIXES, read_address
 from arena_newton.policies.remote.gr00t_client import read_modalities
 from arena_newton.policies.remote.websocket import http_page
 
@@ -308,12 +308,12 @@ def test_gr00t_without_a_declaration(keys, capsys):
     server.close()
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_addresses(door):
+@pytest.mark.parametrize("prefix", PREFIXES)
+def test_addresses(prefix):
     """Every protocol has its name, its transport and a usual port."""
-    address = read_address(f"{door}://host/")
-    assert (address.protocol, address.transport, address.port) == DOORS[door] and address.host == "host"
-    assert read_address(f"{door}://[::1]:99").url.endswith("//[::1]:99")
+    address = read_address(f"{prefix}://host/")
+    assert (address.protocol, address.transport, address.port) == PREFIXES[prefix] and address.host == "host"
+    assert read_address(f"{prefix}://[::1]:99").url.endswith("//[::1]:99")
 
 
 @pytest.mark.parametrize(

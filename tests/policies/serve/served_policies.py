@@ -13,9 +13,9 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy, world_mask
 from arena_newton.policies.protocols.policy_messages import Look
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION
 
@@ -111,9 +111,9 @@ class Served:
         self.policy = policy
         self.server = PolicyServer(policy, **options)
         self.server.start()
-        guard = DoorGuard(connections or self.server.max_sessions, token, local=True)
-        self.door = open_door(self.server, ServeOptions(policy="x", protocol=protocol, port=0), guard, tls)
-        self.port = self.door.port
+        guard = ConnectionGuard(connections or self.server.max_sessions, token, local=True)
+        self.endpoint = open_endpoint(self.server, ServeOptions(policy="x", protocol=protocol, port=0), guard, tls)
+        self.port = self.endpoint.port
         policy.calls = []
 
     def socket(self, **more):
@@ -132,8 +132,8 @@ class Served:
         return reply.status, json.loads(data) if data[:1] == b"{" else data
 
     def close(self):
-        """End door and server."""
-        self.door.close()
+        """End endpoint and server."""
+        self.endpoint.close()
         self.server.close()
 
 

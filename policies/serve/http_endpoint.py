@@ -1,4 +1,4 @@
-"""The door of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
+"""Endpoint of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
 
 Which robot a request is of is said by `policies.serve.http_robots`.
 """
@@ -36,11 +36,11 @@ from arena_newton.policies.protocols.arena_codec import (
 )
 from arena_newton.policies.protocols.policy_messages import Begin, Look
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.connection_guard import HEALTH_PATHS, STRANGER_SECONDS, ConnectionGuard
 from arena_newton.policies.serve.http_robots import HttpRobot, HttpRobots
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
 
-__all__ = ["HttpDoor"]
+__all__ = ["HttpEndpoint"]
 
 IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
@@ -50,7 +50,7 @@ DRAIN_SECONDS, DRAIN_FRAMES = 5.0, 4
 """Time [s] and largest bodies' worth of bytes that are read and dropped so that a client whose body is too long, which
 looks for an answer only when it has sent all of it, gets one."""
 POLL = 0.05
-"""Time after which a door notices that it is closed [s]."""
+"""Time after which an endpoint notices that it is closed [s]."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
@@ -204,7 +204,7 @@ class _Listener(ThreadingHTTPServer):
     request_queue_size, daemon_threads, allow_reuse_address = 128, True, True
 
     def __init__(
-        self, listening: socket.socket, policy: PolicyServer, guard: DoorGuard, tls: ssl.SSLContext | None
+        self, listening: socket.socket, policy: PolicyServer, guard: ConnectionGuard, tls: ssl.SSLContext | None
     ) -> None:
         super().__init__(listening.getsockname()[:2], _Handler, bind_and_activate=False)
         self.socket.close()
@@ -309,28 +309,28 @@ class _Listener(ThreadingHTTPServer):
         return actions if chunk else actions[:1]
 
 
-class HttpDoor:
+class HttpEndpoint:
     """Listens, and translates between JSON and the policy server."""
 
     def __init__(
-        self, server: PolicyServer, listening: socket.socket, guard: DoorGuard, tls: ssl.SSLContext | None = None
+        self, server: PolicyServer, listening: socket.socket, guard: ConnectionGuard, tls: ssl.SSLContext | None = None
     ):
         """Begin to listen.
 
         Args:
             server: Answers; it has started.
-            listening: The port, which belongs to the door from now on.
+            listening: The port, which belongs to the endpoint from now on.
             guard: Who may come in.
             tls: Certificate and key, for `https`.
         """
         self.port = int(listening.getsockname()[1])
         listening.listen(_Listener.request_queue_size)
         self._listener = _Listener(listening, server, guard, tls)
-        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="endpoint", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the door and its connections."""
+        """End the endpoint and its connections."""
         self._listener.shutdown()
         self._listener.hang_up()
         self._listener.server_close()

@@ -1,4 +1,4 @@
-"""The doors: each protocol as its clients speak it, who is let in, and what hostile or slow clients can do."""
+"""Endpoints: each protocol as its clients speak it, who is let in, and what hostile or slow clients can do."""
 
 import http.client
 import json
@@ -303,7 +303,7 @@ def test_a_client_that_left_gives_its_rows_away(served, monkeypatch):
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])
 def test_routes(served, protocol):
-    """Every door answers /healthz, /health and /config; a browser and another route get nothing."""
+    """Every endpoint answers /healthz, /health and /config; a browser and another route get nothing."""
     one = served(Remembers(), protocol)
     assert one.http("GET", "/healthz") == (200, b"OK\n")
     assert one.http("GET", "/health") == (200, {"status": "ok"})

@@ -1,4 +1,4 @@
-"""What hostile, deaf and half-open clients can do to the doors: nothing that another client notices."""
+"""What hostile, deaf and half-open clients can do to the endpoints: nothing that another client notices."""
 
 import base64
 import json
@@ -21,7 +21,7 @@ from served_policies import Remembers, look, state, together
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.arena_codec import unpack_look
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.serve import door_guard, message_readers, websocket_listener
+from arena_newton.policies.serve import connection_guard, message_readers, websocket_listener
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -42,8 +42,8 @@ def plain_socket(port, more=b""):
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "arena"])
-def test_a_connection_that_cannot_be_taken_ends_no_door(served, protocol):
-    """A door whose process has no file descriptors left goes on when there are some again."""
+def test_a_connection_that_cannot_be_taken_ends_no_endpoint(served, protocol):
+    """An endpoint whose process has no file descriptors left goes on when there are some again."""
     one = served(Remembers(), protocol)
     client = socket.socket()
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -93,12 +93,12 @@ def test_a_client_that_reads_nothing_is_hung_up_on(served, monkeypatch):
 
 
 def test_deaf_clients_do_not_hold_up_the_end(served):
-    """A door closes at once, however many clients neither answer nor read."""
+    """An endpoint closes at once, however many clients neither answer nor read."""
     one = served(talkative(), connections=8)
     deaf = [plain_socket(one.port)[0] for _ in range(4)]
     stuff(deaf[0])
     began = time.monotonic()
-    one.door.close()
+    one.endpoint.close()
     assert time.monotonic() - began < 4.0
     for client in deaf:
         client.close()
@@ -118,7 +118,7 @@ def test_strangers_take_no_room(served, protocol):
         client, status = plain_socket(one.port, b"Authorization: Bearer abc\r\n")
         assert status == 101
         client.close()
-    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(door_guard.STRANGERS)]
+    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(connection_guard.STRANGERS)]
     assert more[-1].recv(1) == b""
     for connection in silent + more:
         connection.close()
@@ -133,7 +133,7 @@ def test_strangers_take_no_room(served, protocol):
 
 def test_a_head_by_drips_is_hung_up_on(served, monkeypatch):
     """Whoever sends the first request's head for ever is closed, so that strangers do not gather."""
-    monkeypatch.setattr("arena_newton.policies.serve.http_door.STRANGER_SECONDS", 0.5)
+    monkeypatch.setattr("arena_newton.policies.serve.http_endpoint.STRANGER_SECONDS", 0.5)
     one = served(Remembers(), "arena")
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", one.port), timeout=10) as drips, pytest.raises(OSError, match="."):
