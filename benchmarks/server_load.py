@@ -20,7 +20,7 @@ from arena_newton.interfaces import Chunk, Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
-from arena_newton.policies.protocols.policy_messages import Look
+from arena_newton.policies.protocols.policy_messages import Query
 from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import open_endpoint
@@ -119,9 +119,9 @@ def _ask(
     """Play clients, each in a thread, and send the times of their answers."""
     state = np.zeros(STATE_WIDTH, np.float32)
     state[[0, 3]] = 1.0
-    look = Look(state, np.zeros(shape, np.uint8), task="boxing", instruction="Box.")
+    query = Query(state, np.zeros(shape, np.uint8), task="boxing", instruction="Box.")
     openpi = protocol == "openpi"
-    body = openpi_codec.pack_request(look) if openpi else vla_eval_codec.pack_request(look, 1, 0.0)
+    body = openpi_codec.pack_request(query) if openpi else vla_eval_codec.pack_request(query, 1, 0.0)
     times: list[float] = []
 
     def client() -> None:

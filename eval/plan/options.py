@@ -72,12 +72,12 @@ class Chunks:
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
     itself when none is named, and v3.1 where it says nothing."""
     replan: int | None = None
-    """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
+    """For --policy lerobot: execute only the first so many actions of each chunk, then query it again."""
     ensemble: bool = False
-    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; looks every 2 ticks, or as
+    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; queried every 2 ticks, or as
     --replan says."""
     latency_ticks: int = 0
-    """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
+    """Ticks of 0.02 s from a policy's query to the first action of its chunk; the chunk before goes on meanwhile."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class EvaluatedCell:
     latency: int
     """Ticks by which each chunk started late."""
     replan: int | None
-    """Actions of a chunk that were executed before the next look; None: all."""
+    """Actions of a chunk that were executed before the next query; None: all."""
     ensemble: bool
     records: tuple[EpisodeRecord, ...]
     """Its episodes in plan order."""

@@ -122,7 +122,7 @@ class PolicyCheckpoint:
 
     @property
     def executed(self) -> int:
-        """Actions of an answer that are executed before the next look."""
+        """Actions of an answer that are executed before the next query."""
         return int(self.config.n_action_steps)
 
 

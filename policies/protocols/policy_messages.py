@@ -21,7 +21,7 @@ __all__ = [
     "PICTURE_SIDES",
     "Begin",
     "End",
-    "Look",
+    "Query",
     "Request",
     "check_picture_size",
     "read_actions",
@@ -59,7 +59,7 @@ class Begin:
 
 
 @dataclass(frozen=True)
-class Look:
+class Query:
     """A robot shows what it sees and asks for a chunk."""
 
     state: np.ndarray
@@ -91,7 +91,7 @@ class End:
     """The robot's report of it."""
 
 
-type Request = Begin | Look | End
+type Request = Begin | Query | End
 """Message of a robot."""
 
 

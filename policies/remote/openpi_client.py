@@ -57,7 +57,7 @@ class OpenpiLink(SocketLink):
             self.policy.text_of(answer, self.url + self.policy.reset_kind)
         return None
 
-    def look(self, request: SocketRequest, end: float) -> object:
+    def query(self, request: SocketRequest, end: float) -> object:
         """Show what a world sees, or all of a batch."""
         if request.batch is not None:
             self.send(request.batch)

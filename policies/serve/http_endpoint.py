@@ -32,9 +32,9 @@ from arena_newton.policies.protocols.arena_codec import (
     pack_failure,
     read_client,
     unpack_begin,
-    unpack_look,
+    unpack_query,
 )
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.connection_guard import HEALTH_PATHS, STRANGER_SECONDS, ConnectionGuard
 from arena_newton.policies.serve.http_robots import HttpRobot, HttpRobots
@@ -90,7 +90,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
 
     def do_POST(self) -> None:  # noqa: N802 (the name that http.server calls)
-        """Begin an episode, or answer a look."""
+        """Begin an episode, or answer a query."""
         path = self.path.partition("?")[0]
         if self._refused(path):
             return
@@ -104,9 +104,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.begin(address, client, self.connection, unpack_begin(body))
                 self._send(200, pack_begun(policy.facts))
             elif path == "/infer":
-                look, chunk = policy.read(len(body), partial(unpack_look, body))
+                query, chunk = policy.read(len(body), partial(unpack_query, body))
                 del body  # its picture is unpacked
-                actions = self.server.look(address, client, self.connection, look, chunk=chunk)
+                actions = self.server.query(address, client, self.connection, query, chunk=chunk)
                 self._send(200, pack_chunk(actions, chunk=chunk))
             else:
                 self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
@@ -293,18 +293,18 @@ class _Listener(ThreadingHTTPServer):
         self.policy.begin(robot.owner, replace(begin, session=robot.session), held=False)
         robot.kept.clear()
 
-    def look(
-        self, address: str, client: str, connection: socket.socket, look: Look, *, chunk: bool = True
+    def query(
+        self, address: str, client: str, connection: socket.socket, query: Query, *, chunk: bool = True
     ) -> np.ndarray:
         """The chunk of a robot; without `chunk` one action, shape [1, 40]: of its last chunk while some are left."""
-        robot = self._robots.looking(address, client, connection, look.session, look.seed, begins=look.step == 0)
-        if not chunk and look.step is None:
+        robot = self._robots.querying(address, client, connection, query.session, query.seed, begins=query.step == 0)
+        if not chunk and query.step is None:
             with suppress(IndexError):
                 return robot.kept.popleft()[None]
-        return self._asked(robot, look, chunk=chunk)
+        return self._asked(robot, query, chunk=chunk)
 
-    def _asked(self, robot: HttpRobot, look: Look, *, chunk: bool) -> np.ndarray:
-        actions = self.policy.look(robot.owner, replace(look, session=robot.session), held=False).actions
+    def _asked(self, robot: HttpRobot, query: Query, *, chunk: bool) -> np.ndarray:
+        actions = self.policy.query(robot.owner, replace(query, session=robot.session), held=False).actions
         robot.kept = deque() if chunk else deque(actions[1:])
         return actions if chunk else actions[:1]
 

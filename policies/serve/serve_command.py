@@ -28,7 +28,7 @@ __all__ = ["make_policy", "open_endpoint", "serve_policy"]
 type Say = Callable[[str], None]
 
 USUAL_TASK = "boxing"
-"""Task of the first look, where neither the flags nor the policy ask for another."""
+"""Task of the first query, where neither the flags nor the policy ask for another."""
 
 M_MMAP_THRESHOLD, LARGE_BUFFER = -3, 2**20
 """Option of glibc's `mallopt`, and the size of buffers that get memory of their own [bytes]."""

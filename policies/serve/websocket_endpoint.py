@@ -28,7 +28,7 @@ from arena_newton.errors import ArenaError
 from arena_newton.files.text import plain_text
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.arena_codec import pack_config, pack_failure
-from arena_newton.policies.protocols.policy_messages import Begin, End, Look
+from arena_newton.policies.protocols.policy_messages import Begin, End, Query
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.serve.connection_guard import HEALTH_PATHS, ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
@@ -132,7 +132,7 @@ class WebsocketEndpoint:
                     self._policy.begin(owner, request)
                     connection.send(openpi_codec.RESET_ANSWER)
                     continue
-                answer = self._policy.look(owner, request)
+                answer = self._policy.query(owner, request)
                 frame = openpi_codec.pack_answer(answer.actions, answer.infer_ms, total, roboarena=roboarena)
             except ArenaError as error:  # openpi's server says so in a text frame, too, and closes
                 connection.send(plain_text(error, 300))
@@ -158,7 +158,7 @@ class WebsocketEndpoint:
                 if message.type in ("error", "record"):
                     continue
                 request = vla_eval_codec.unpack_request(message)
-                if isinstance(request, Look):
+                if isinstance(request, Query):
                     rest = kept.pop(request.session, deque())
                     actions = self._actions(owner, request, rest, whole=whole)
                     if rest:
@@ -173,12 +173,12 @@ class WebsocketEndpoint:
             except ArenaError as error:
                 connection.send(vla_eval_codec.pack_error(plain_text(error, 300), seq, time.time()))
 
-    def _actions(self, owner: str, look: Look, kept: deque[np.ndarray], *, whole: bool) -> np.ndarray:
+    def _actions(self, owner: str, query: Query, kept: deque[np.ndarray], *, whole: bool) -> np.ndarray:
         """A chunk, or the next action of one, as a robot takes them."""
         if whole:
-            return self._policy.look(owner, look).actions
+            return self._policy.query(owner, query).actions
         if not kept:
-            kept.extend(self._policy.look(owner, look).actions)
+            kept.extend(self._policy.query(owner, query).actions)
         return kept.popleft()
 
 

@@ -162,19 +162,19 @@ def argv(monkeypatch, checkpoint, *flags):
 
 
 def test_the_checkpoint_says_how_it_is_played(checkpoint, monkeypatch, tmp_path):
-    """Labels, picture, task vector and looks are those of `--policy.path`; flags that are given count more."""
+    """Labels, picture, task vector and queries are those of `--policy.path`; flags that are given count more."""
     argv(monkeypatch, checkpoint)
     said = ArenaNewtonEnv(task="boxing").policy_worlds
-    assert (said.labels, said.realign, said.look_ticks, said.task_vector) == ("v4", 0.05, 6, TASKS)
+    assert (said.labels, said.realign, said.query_ticks, said.task_vector) == ("v4", 0.05, 6, TASKS)
     assert (said.width, said.height, said.fit) == (SIDE, SIDE, "native")
     own = ArenaNewtonEnv(task="boxing", fit="pad", realign=0.0, image_width=96, labels="v3.1", task_vector="boxing")
     assert own.policy_worlds.fit == "pad" and own.policy_worlds.realign == 0.0 and own.policy_worlds.labels == "v3.1"
     assert own.features["observation.images.front"].shape == (SIDE, 96, 3) and own.policy_worlds.height == SIDE
     assert own.features["observation.environment_state"].shape == (1,)
     argv(monkeypatch, checkpoint, "--policy.n_action_steps=3")
-    assert ArenaNewtonEnv(task="boxing").policy_worlds.look_ticks == 3
+    assert ArenaNewtonEnv(task="boxing").policy_worlds.query_ticks == 3
     argv(monkeypatch, checkpoint, "--policy.temporal_ensemble_coeff=0.01", "--policy.n_action_steps=1")
-    assert ArenaNewtonEnv(task="boxing").policy_worlds.look_ticks == 1
+    assert ArenaNewtonEnv(task="boxing").policy_worlds.query_ticks == 1
     with pytest.raises(InputError, match="--env.task football: the policy was trained on boxing, vis_navi"):
         ArenaNewtonEnv(task="football")
     argv(monkeypatch, tmp_path)  # none of ours

@@ -88,8 +88,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Protocol of the policy's actions: v3.1, or v4, which is decoded per world; the policy's, or v3.1."""
     realign: float | None = None
     """Of v4: fraction of the gap between commanded and measured heading that is closed each tick; the policy's."""
-    look_ticks: int | None = None
-    """Of v4: ticks between two looks of the policy, at which `realign` measures the heading: its n_action_steps."""
+    query_ticks: int | None = None
+    """Of v4: ticks between two queries of the policy, at which `realign` measures the heading: its n_action_steps."""
     task_vector: str | None = None
     """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
     episodes: str | None = None
@@ -114,7 +114,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         worlds = self.policy_worlds = PolicyWorlds(
             labels=said.labels if self.labels is None else self.labels,
             realign=said.realign if self.realign is None else self.realign,
-            look_ticks=said.look_ticks if self.look_ticks is None else self.look_ticks,
+            query_ticks=said.query_ticks if self.query_ticks is None else self.query_ticks,
             task_vector=said.task_vector if self.task_vector is None else _names(self.task_vector),
             width=said.width if self.image_width is None else self.image_width,
             height=said.height if self.image_height is None else self.image_height,
@@ -126,8 +126,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(f"--env.fit {worlds.fit}: unknown, choose from {', '.join(FITS)}")
         if not 0.0 <= worlds.realign <= 1.0:
             raise InputError(f"--env.realign {worlds.realign}: expected 0 to 1")
-        if worlds.look_ticks < 1:
-            raise InputError(f"--env.look_ticks {worlds.look_ticks}: expected at least 1")
+        if worlds.query_ticks < 1:
+            raise InputError(f"--env.query_ticks {worlds.query_ticks}: expected at least 1")
         for task in self.tasks:
             task_registry.get(task)
             if worlds.task_vector and task not in worlds.task_vector:

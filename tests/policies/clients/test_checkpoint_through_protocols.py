@@ -58,7 +58,7 @@ class Gr00tCheckpoint(Gr00tServer):
         state = np.concatenate([seen["state"][name] for name in MODALITIES["state"]["modality_keys"]], axis=-1)[:, 0]
         tasks = [options["task"]] * len(state)
         self.policy.reset(options["seed"], tasks)
-        looks = Observation(
+        queries = Observation(
             torch.from_numpy(state.copy()),
             torch.from_numpy(seen["video"]["ego_view"][:, 0].copy()),
             np.ones(len(state), bool),
@@ -66,7 +66,7 @@ class Gr00tCheckpoint(Gr00tServer):
             options["task"],
             "Strike.",
         )
-        chunk = np.asarray(self.policy.act(looks).actions, np.float32)
+        chunk = np.asarray(self.policy.act(queries).actions, np.float32)
         return [{name: chunk[..., part] for name, part in V4.items()}, {}]
 
 

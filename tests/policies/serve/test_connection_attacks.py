@@ -16,10 +16,10 @@ from contextlib import ExitStack, suppress
 import msgpack
 import numpy as np
 import pytest
-from served_policies import Remembers, look, state, together
+from served_policies import Remembers, query, state, together
 
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
-from arena_newton.policies.protocols.arena_codec import unpack_look
+from arena_newton.policies.protocols.arena_codec import unpack_query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve import connection_guard, message_readers, websocket_listener
 
@@ -69,8 +69,8 @@ def talkative():
 
 
 def stuff(connection):
-    """Send looks until neither side's buffer takes any more, and return one."""
-    frame = openpi_codec.pack_request(look(seed=1, step=0))
+    """Send queries until neither side's buffer takes any more, and return one."""
+    frame = openpi_codec.pack_request(query(seed=1, step=0))
     frame = b"\x82\xfe" + struct.pack(">H", len(frame)) + bytes(4) + frame
     connection.settimeout(0.5)
     with suppress(TimeoutError):
@@ -215,7 +215,7 @@ def test_robots_with_the_largest_pictures_are_read_one_by_one(served, monkeypatc
     monkeypatch.setattr(message_readers, "LONGEST_PAUSE", 0.0)
     one = served(Remembers(sees=True), protocol)
     openpi = protocol == "openpi"
-    raw = openpi_codec.pack_request(look(image=np.zeros((*LARGEST[::-1], 3), np.uint8)))
+    raw = openpi_codec.pack_request(query(image=np.zeros((*LARGEST[::-1], 3), np.uint8)))
     frame = raw if openpi else asked_with(front=picture(*LARGEST))
 
     def ask():
@@ -283,7 +283,7 @@ def test_values_of_json_are_counted():
     """A body that would become millions of Python objects is refused before it is read."""
     body = b'{"observation": {"state": [' + b"[]," * 100_000 + b"1]}}"
     with pytest.raises(WireError, match="^/infer: more than 65536 values$"):
-        unpack_look(body)
+        unpack_query(body)
 
 
 def test_one_action_at_a_time(served):
