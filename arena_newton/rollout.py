@@ -53,7 +53,7 @@ def ending(env: World, code: int, tick: int, budget: int) -> tuple[str, str, str
 
     Args:
         env: The worlds.
-        code: What `env.step` said of the episode's world.
+        code: Code of `env.step` for the episode's world.
         tick: Ticks since its step 0, the one that ended now included; negative in the start-up.
         budget: Its step budget [ticks].
     """

@@ -192,7 +192,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._next: int | None = None
         """Number of the next episode that nobody plays yet; None before the first reset."""
         self._begun = np.zeros(n, dtype=bool)
-        self._over, self._told, self._terminated = (np.zeros(n, dtype=bool) for _ in range(3))
+        self._over, self._reported, self._terminated = (np.zeros(n, dtype=bool) for _ in range(3))
         """Worlds whose episode ended; whose end a step has returned; whose end is no truncation."""
         self._outcome, self._reason = (np.full(n, "", dtype=object) for _ in range(2))
         self._margin = np.full(n, np.nan)
@@ -291,7 +291,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self.env.reset(self._episode_seed[worlds].tolist(), worlds)
         self._begun |= mask
         self._unfilmed |= mask
-        for flags in (self._over, self._told, self._terminated):
+        for flags in (self._over, self._reported, self._terminated):
             flags[mask] = False
         self._outcome[mask] = self._reason[mask] = ""
         self._margin[mask] = np.nan
@@ -334,7 +334,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             InputError: Actions of another shape, or no reset before.
         """
         action = self._checked(actions)
-        restart = self._over & self._told if self.autoreset_mode == AutoresetMode.NEXT_STEP else self._over & False
+        restart = self._over & self._reported if self.autoreset_mode == AutoresetMode.NEXT_STEP else self._over & False
         stepping = ~self._over
         rewards = np.zeros(self.num_envs)
         if stepping.any():
@@ -347,7 +347,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._unfilmed |= seen
         ended = self._over & ~restart
         terminated, truncated = ended & self._terminated, ended & ~self._terminated
-        self._told |= ended
+        self._reported |= ended
         final: Info = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
             final = self._final(ended)
@@ -418,9 +418,9 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         ended = mask & self._over
         if ended.any():
             for name, words in (("outcome", self._outcome), ("reason", self._reason)):
-                said = np.full(self.num_envs, None, dtype=object)
-                said[ended] = words[ended]
-                info[name], info[f"_{name}"] = said, ended.copy()
+                declared = np.full(self.num_envs, None, dtype=object)
+                declared[ended] = words[ended]
+                info[name], info[f"_{name}"] = declared, ended.copy()
         return info
 
     def _final(self, ended: np.ndarray) -> Info:

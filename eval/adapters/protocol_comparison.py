@@ -135,15 +135,15 @@ def run(options: ProtocolOptions) -> int:
         print(f"{protocol}: {solved} of {len(play.episodes)}, {play.seconds:.0f} s", flush=True)
     promised = SAME_BITS if (options.engine, options.device) == ("mujoco", "cpu") else ()
     rows = compare_protocols(plays, options.first, promised)
-    said = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
+    message = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
     text = protocol_table(rows, options.first)
     commands = "\n".join(f"- {row.protocol}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
-    write_atomic(out / "protocols.md", f"{said}\n\n{text}\n{commands}\n")
+    write_atomic(out / "protocols.md", f"{message}\n\n{text}\n{commands}\n")
     # Keys of a stored file do not follow the name of the command.
     compared = [{"door": row.protocol, **asdict(row)} for row in rows]
     facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": compared}
     write_atomic(out / "protocols.json", json.dumps(facts, indent=2) + "\n")
-    print(f"\n{said}\n\n{text}")
+    print(f"\n{message}\n\n{text}")
     broken = [row.protocol for row in rows if not row.kept]
     print(f"differs, but must not: {' '.join(broken)}" if broken else "what is promised holds")
     print(f"written: {out / 'protocols.md'} and protocols.json")
@@ -313,7 +313,7 @@ def _call(protocol: str, command: Sequence[str], log: Path, allowed: Sequence[in
 
 def _last_line(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1][:300] if lines else "it said nothing"
+    return lines[-1][:300] if lines else "it printed nothing"
 
 
 @contextlib.contextmanager
@@ -323,13 +323,13 @@ def _server(protocol: str, command: Sequence[str], log: Path) -> Iterator[str]:
         made = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(one_thread=True)
         )
-    said: list[str] = []
+    lines: list[str] = []
     listens = threading.Event()
 
     def read() -> None:
         assert made.stdout is not None
         for line in made.stdout:
-            said.append(line.rstrip("\n"))
+            lines.append(line.rstrip("\n"))
             if line.startswith(ADDRESS):
                 listens.set()
         listens.set()
@@ -338,7 +338,7 @@ def _server(protocol: str, command: Sequence[str], log: Path) -> Iterator[str]:
     reader.start()
     try:
         listens.wait(START_S)
-        found = [line.removeprefix(ADDRESS) for line in said if line.startswith(ADDRESS)]
+        found = [line.removeprefix(ADDRESS) for line in lines if line.startswith(ADDRESS)]
         if not found:
             why = f"its server does not listen, {_last_line(log)}"
             raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
@@ -352,7 +352,7 @@ def _server(protocol: str, command: Sequence[str], log: Path) -> Iterator[str]:
             made.wait()
         reader.join(END_S)
         with contextlib.suppress(OSError), log.open("a") as file:
-            file.write("\n".join(said) + "\n")
+            file.write("\n".join(lines) + "\n")
 
 
 type Ending = tuple[str, str | None, int, float | None]

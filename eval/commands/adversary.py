@@ -161,18 +161,18 @@ class _Found:
 
     def lines(self) -> list[str]:
         """In words."""
-        told = [f"mean over the range: {_rate(*self.mean)}"]
+        parts = [f"mean over the range: {_rate(*self.mean)}"]
         if self.worst is None or self.confirmed is None:
-            return [*told, "worst: none judged"]
-        told.append(f"worst of {counted(self.episodes, 'episode')}: {self.worst.where(self.axes)}")
+            return [*parts, "worst: none judged"]
+        parts.append(f"worst of {counted(self.episodes, 'episode')}: {self.worst.where(self.axes)}")
         ended = (
             f"slowest of its successes {self.worst.success_s:.1f} s"
             if self.worst.rate == 1.0
             else (f"{self.worst.successes}/{self.worst.judged}, mean margin {self.worst.mean_margin:+.3f} m")
         )
-        told.append(f"  as found: {ended}")
-        told.append(f"  with new seeds: {_rate(self.confirmed.successes, self.confirmed.judged)}")
-        return told
+        parts.append(f"  as found: {ended}")
+        parts.append(f"  with new seeds: {_rate(self.confirmed.successes, self.confirmed.judged)}")
+        return parts
 
 
 def _rate(successes: int, judged: int) -> str:
@@ -185,8 +185,8 @@ def _json(options: AdversaryOptions, found: _Found) -> str:
     def plain(one: PointTally | None) -> dict[str, object] | None:
         if one is None:
             return None
-        told = dataclasses.asdict(one) | {"success_rate": one.rate}
-        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in told.items()}
+        facts = dataclasses.asdict(one) | {"success_rate": one.rate}
+        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in facts.items()}
 
     document = {
         "format": FORMAT,

@@ -129,13 +129,13 @@ def summary(axes: Sequence[Axis], points: Sequence[PointTally]) -> list[str]:
     ]
     if errors:
         lines.append(f"{counted(errors, 'episode')} ended with an error and are in no rate")
-    told = [one for one in points if one.judged]
+    rated = [one for one in points if one.judged]
     if successes < judged:
-        worst = min(told, key=lambda one: (one.rate, one.mean_margin))
+        worst = min(rated, key=lambda one: (one.rate, one.mean_margin))
         counts = f"{worst.successes}/{worst.judged}, mean margin {worst.mean_margin:+.3f} m"
         lines.append(f"worst at {worst.where(axes)}: {counts}")
-    elif told:
-        slowest = max(told, key=lambda one: one.success_s)
+    elif rated:
+        slowest = max(rated, key=lambda one: one.success_s)
         lines.append(f"slowest at {slowest.where(axes)}: {slowest.success_s:.1f} s")
     return lines
 
@@ -144,7 +144,7 @@ def _json(
     options: SensitivityOptions, axes: Sequence[Axis], grid: Sequence[Sequence[float]], points: Sequence[PointTally]
 ) -> str:
     successes, judged = sum(one.successes for one in points), sum(one.judged for one in points)
-    told = [
+    lines = [
         {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
         for row in (dataclasses.asdict(one) | {"success_rate": one.rate} for one in points)
     ]
@@ -158,6 +158,6 @@ def _json(
         "successes": successes,
         "judged": judged,
         "interval": wilson(successes, judged),
-        "points": told,
+        "points": lines,
     }
     return json.dumps(document, indent=2, allow_nan=False) + "\n"

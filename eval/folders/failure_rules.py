@@ -129,8 +129,8 @@ def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
 
 def _touched(episode: Judged, signals: EpisodeSignals, task: Interaction) -> int | None:
     """Tick of the first touch; None where there was none, or the task's own predicate says that there was none."""
-    said = episode.predicates.get(task.predicate, signals.first_touch)
-    return None if said is None or signals.first_touch is None else max(said, signals.first_touch)
+    declared = episode.predicates.get(task.predicate, signals.first_touch)
+    return None if declared is None or signals.first_touch is None else max(declared, signals.first_touch)
 
 
 def _without_effect(episode: Judged, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:

@@ -174,14 +174,14 @@ class CellPlayer:
             if difference is None:
                 continue
             key, was, now, is_code = difference
-            said = f"{name}: {key} was {setting(was)}, now {setting(now)}"
+            text = f"{name}: {key} was {setting(was)}, now {setting(now)}"
             finished = len(run.records) == run.document["planned"]
             if not is_code:
-                changed.append(said)
+                changed.append(text)
             elif finished and self.options.accept_code:
                 continue
             elif not (self.options.accept_code and not finished):
-                code.append(said)
+                code.append(text)
             names.append(name)
         if changed and not self.options.accept_changes:
             raise InputError(

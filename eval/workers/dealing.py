@@ -221,7 +221,7 @@ class DealtRun:
             self._keep(assignment, EpisodeRecord.from_json(f"a process of {self.pool.backend.flag}", message.line))
         elif isinstance(message, Lost):
             self._again(assignment, message)
-        elif isinstance(message, Done) and assignment.left:  # told of as ended without a line: no process does that
+        elif isinstance(message, Done) and assignment.left:  # reported as ended without a line: no process does that
             self._again(assignment, Lost("episodes were left out"))
         elif isinstance(message, ArenaError):
             raise message

@@ -128,8 +128,8 @@ def loaded_network(path: Path, sizes: ActSizes, weights: dict[str, torch.Tensor]
         network = ActNetwork(sizes)
         network.load(weights)
     except (KeyError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: does not hold the weights of this network: {text}") from None
     return network
 
 
@@ -144,8 +144,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         with safe_open(path, framework="pt") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: not readable as safetensors ({said})") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: not readable as safetensors ({text})") from None
     for name, value in found.items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")

@@ -54,7 +54,7 @@ class Begin:
     seed: int | None = None
     """Episode seed; None: the server chooses."""
     task: str = ""
-    """Gym id or name of the task; empty: not said."""
+    """Gym id or name of the task; empty: not given."""
     instruction: str = ""
 
 
@@ -74,9 +74,9 @@ class Query:
     seed: int | None = None
     """As in `Begin`; with `step` 0 it begins an episode that no `Begin` has announced."""
     step: int | None = None
-    """Actions that the episode has executed so far; None: not said."""
+    """Actions that the episode has executed so far; None: not given."""
     robot_type: str = ""
-    """The label protocol's `robot_type` that the robot executes; empty: not said."""
+    """The label protocol's `robot_type` that the robot executes; empty: not given."""
     packed: PackedPicture | None = None
     """The picture as its sender packed it, instead of `image`."""
 

@@ -61,7 +61,7 @@ class SimplePolicy(RemotePolicy):
     """Asks a server of SIMPLE's protocol, one request per world."""
 
     infer_kind = "/act"
-    said = "a policy server of SIMPLE's protocol"
+    described = "a policy server of SIMPLE's protocol"
     camera = CameraConfig(width=640, height=480, fit="native")
     """640×480: its servers cut and resize."""
 

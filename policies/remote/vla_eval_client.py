@@ -76,7 +76,7 @@ class VlaEvalLink(SocketLink):
 class VlaEvalPolicy(SocketClient):
     """Asks a server of vla-eval's protocol."""
 
-    said = "a policy server of vla-eval's protocol"
+    described = "a policy server of vla-eval's protocol"
     camera = CameraConfig()
     """224×224 with black bars."""
 
@@ -105,8 +105,8 @@ class VlaEvalPolicy(SocketClient):
             return reply
         message, seq = reply
         if isinstance(message, VlaEvalMessage) and message.type == "error":
-            said = self.one_line(message.payload.get("error", "nothing"))
-            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=episode_lost(said))
+            declared = self.one_line(message.payload.get("error", "nothing"))
+            raise RemoteError(f"{self.url}{kind}: the server says {declared}", lost=episode_lost(declared))
         return message, seq
 
     def _rows(self, content: object) -> np.ndarray:

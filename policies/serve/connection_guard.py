@@ -17,7 +17,7 @@ __all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "Connect
 ACCESS_TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that clients must send; the same of which clients take theirs."""
 STRANGERS = 64
-"""Connections that have not said yet who they are, at once; more are closed unread."""
+"""Connections that have not identified themselves yet, at once; more are closed unread."""
 STRANGER_SECONDS = 10.0
 """Time that a connection has to say who it is [s]."""
 HEALTH_PATHS = ("/healthz", "/health")

@@ -212,7 +212,7 @@ class _Listener(ThreadingHTTPServer):
         self.policy, self.guard, self.tls = policy, guard, tls
         self._robots = HttpRobots()
         self._open: dict[socket.socket, float] = {}
-        """Connection → when it must have said who it is [s]."""
+        """Connection → when it must have identified itself [s]."""
         self._lock = threading.Lock()
 
     def get_request(self) -> tuple[socket.socket, tuple[str, int]]:

@@ -320,7 +320,7 @@ class FilmPool(Filming):
                 self._ended(worker)
 
     def _receive(self, patience: float) -> None:
-        """Read what processes have said, waiting for the first of it so long [s]."""
+        """Read messages of processes, waiting for the first so long [s]."""
         for key, _ in self._selector.select(patience):
             with self._whole:
                 self._read(key.data)

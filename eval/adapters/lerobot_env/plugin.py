@@ -108,17 +108,17 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(
                 f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
             )
-        said = policy_worlds()
-        if said.source is not None:
-            logger.info("%s says %s; flags that are given count more", said.source, said.sentence)
+        declared = policy_worlds()
+        if declared.source is not None:
+            logger.info("%s says %s; flags that are given count more", declared.source, declared.sentence)
         worlds = self.policy_worlds = PolicyWorlds(
-            labels=said.labels if self.labels is None else self.labels,
-            realign=said.realign if self.realign is None else self.realign,
-            query_ticks=said.query_ticks if self.query_ticks is None else self.query_ticks,
-            task_vector=said.task_vector if self.task_vector is None else _names(self.task_vector),
-            width=said.width if self.image_width is None else self.image_width,
-            height=said.height if self.image_height is None else self.image_height,
-            fit=said.fit if self.fit is None else self.fit,
+            labels=declared.labels if self.labels is None else self.labels,
+            realign=declared.realign if self.realign is None else self.realign,
+            query_ticks=declared.query_ticks if self.query_ticks is None else self.query_ticks,
+            task_vector=declared.task_vector if self.task_vector is None else _names(self.task_vector),
+            width=declared.width if self.image_width is None else self.image_width,
+            height=declared.height if self.image_height is None else self.image_height,
+            fit=declared.fit if self.fit is None else self.fit,
         )
         if worlds.labels not in LABELS:
             raise InputError(f"--env.labels {worlds.labels}: unknown, choose from {', '.join(LABELS)}")
