@@ -174,7 +174,7 @@ class Ray:
     ray_gpus: float | None = None
     """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
     ray_minutes: float = 60.0
-    """With --ray: a slice of a run, at most two batches of worlds, that takes longer is stopped and played again."""
+    """With --ray: a batch of episodes, at most twice --worlds, that takes longer is stopped and played again."""
     ray_attempts: int = 3
     """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
 

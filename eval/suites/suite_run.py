@@ -27,7 +27,7 @@ from arena_newton.eval.suites.suite_file import SuiteFile
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import CellEnding, CellEvent, SuiteCell
-from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.eval.workers.batch_player import device_name
 from arena_newton.files.text import counted, plain_text
 from arena_newton.rules.seeding import policy_seed
 

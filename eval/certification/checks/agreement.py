@@ -22,7 +22,7 @@ from arena_newton.eval.certification.finding import (
 )
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import mcnemar
-from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.eval.workers.batch_player import device_name
 from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
 
