@@ -47,7 +47,7 @@ NAMESPACE = "arena_newton"
 """Prefix of every id."""
 IMAGE_SIZE = (224, 224)
 """Width and height of observed pictures [px], as policies of the original see them."""
-SETTLE = ("steps", "reset")
+STARTUP = ("steps", "reset")
 """Calls in which an episode's start-up happens: steps whose action is ignored, or the reset."""
 REWARDS = ("success", "margin")
 """1 at success; or the change of the task's margin per tick, and 1 at success."""
@@ -99,7 +99,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         cameras: Mapping[str, str] | None = None,
         state_keys: Sequence[str] = ("agent_pos",),
         instruction: bool = True,
-        settle: str = "steps",
+        startup: str = "steps",
         reward: str = "success",
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         repeats: int = PROTOCOL_REPEATS,
@@ -127,7 +127,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
                 default `pixels` is the head camera's picture itself.
             state_keys: Names under which the state is observed.
             instruction: Observe the instruction too, as `task`.
-            settle: `steps`: an episode's start-up is ordinary steps whose action is ignored, and `info["settling"]`
+            startup: `steps`: an episode's start-up is ordinary steps whose action is ignored, and `info["startup"]`
                 names the worlds that are in it. `reset`: a reset leads its worlds through it while the others wait; a
                 robot that falls meanwhile is terminated by the next step.
             reward: `success`: 1 at success, else 0. `margin`: from the second tick on the change of the task's margin
@@ -144,7 +144,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         Raises:
             InputError: Something named in the message is unknown or does not fit.
         """
-        self.settle = _choice("settle", settle, SETTLE)
+        self.startup = _choice("startup", startup, STARTUP)
         self.reward = _choice("reward", reward, REWARDS)
         self.render_mode = None if render_mode is None else _choice("render_mode", render_mode, ("rgb_array",))
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
@@ -174,8 +174,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Instruction in natural language."""
         self.budget = self.env.budget if cap is None else min(cap, self.env.budget)
         """Step budget of an episode after its start-up [ticks]."""
-        startup = self.env.startup_ticks if self.settle == "steps" else 0
-        self._max_episode_steps = startup + self.budget  # the name by which LeRobot asks
+        ticks = self.env.startup_ticks if self.startup == "steps" else 0
+        self._max_episode_steps = ticks + self.budget  # the name by which LeRobot asks
         self._named, self._instruction = cameras is not None, instruction
         self._cameras: dict[str, Camera] = {}
         if size is not None:
@@ -295,17 +295,17 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             flags[mask] = False
         self._outcome[mask] = self._reason[mask] = ""
         self._margin[mask] = np.nan
-        if self.settle == "reset":
+        if self.startup == "reset":
             self._lead_through(mask)
 
     def _lead_through(self, mask: np.ndarray) -> None:
         """Take the worlds of a mask through their start-up; the others wait."""
         stand = np.tile(STAND_ACTION, (self.num_envs, 1))
         while True:
-            settling = mask & ~self._over & (self.env.tick < 0)
-            if not settling.any():
+            startup = mask & ~self._over & (self.env.tick < 0)
+            if not startup.any():
                 return
-            self._end(self.env.step(stand, settling), settling)
+            self._end(self.env.step(stand, startup), startup)
 
     def _end(self, status: np.ndarray, stepped: np.ndarray) -> None:
         """End the episodes that a tick ended; their worlds stand still from now on."""
@@ -401,7 +401,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
     def _facts(self) -> dict[str, np.ndarray]:
         """Values of `info` for every world."""
         return {
-            "settling": (self.env.tick < 0) & ~self._over,
+            "startup": (self.env.tick < 0) & ~self._over,
             "seed": self._seed.copy(),
             "episode_seed": self._episode_seed.copy(),
             "steps": np.maximum(self.env.tick, 0),

@@ -178,7 +178,7 @@ class _PoolPlayer(CellPlayer):
         folder.make()
         with self.silence():
             journal = cell.held.enter_context(Journal(folder.journal))
-            folder.settle(config, journal.records)
+            folder.prepare(config, journal.records)
             folder.sweep()
             cell.held.callback(folder.sweep)
             done, waiting = begun(config, folder, journal)

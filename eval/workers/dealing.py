@@ -81,7 +81,7 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
         config = pool.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
-        folder.settle(config, journal.records)
+        folder.prepare(config, journal.records)
         folder.sweep()
         ended.callback(_swept, pool, folder)
         try:
@@ -141,7 +141,7 @@ class DealtRun:
         shown: Progress,
         besides: Callable[[], int] = lambda: 0,
     ):
-        """Take what is to be played of a run whose folder was settled.
+        """Take what is to be played of a run whose folder was prepared.
 
         Args:
             job: The run.

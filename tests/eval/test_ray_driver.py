@@ -74,7 +74,7 @@ def driven(tmp_path):
         job = Job(folder)
         pool = StubPool(job, size, lost, made_of)
         with Journal(folder.journal) as journal:
-            folder.settle(config, journal.records)
+            folder.prepare(config, journal.records)
             done, waiting = begun(config, folder, journal)
             dealing._play(dealing.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         return read_journal(folder.journal)[0], pool, folder

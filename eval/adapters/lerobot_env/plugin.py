@@ -180,7 +180,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             "cameras": self.prims,
             "state_keys": ("agent_pos", OBS_STATE),
             "instruction": False,
-            "settle": "reset",
+            "startup": "reset",
             "autoreset_mode": "disabled",
             "max_episode_steps": self.episode_length,
         }
