@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.messages import Batch, Broke, Event, Node, Opened, broke
+from arena_newton.eval.workers.messages import Broke, EpisodeBatch, Event, Node, Opened, broke
 
 if TYPE_CHECKING:
     from arena_newton.eval.plan.config import RunConfig
@@ -57,7 +57,7 @@ class EpisodeActor:
         self._folder = Path(folder)
         return self._thread.submit(self._open, options, factories).result()
 
-    def play(self, part: Batch) -> Iterator[Event]:
+    def play(self, part: EpisodeBatch) -> Iterator[Event]:
         """Play episodes; gives what happens when it happens."""
         events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
         self._thread.submit(self._play, part, events)
@@ -86,7 +86,7 @@ class EpisodeActor:
         except (Exception, SystemExit) as error:
             return broke(error)
 
-    def _play(self, part: Batch, events: queue.SimpleQueue[Event | None]) -> None:
+    def _play(self, part: EpisodeBatch, events: queue.SimpleQueue[Event | None]) -> None:
         try:
             from arena_newton.eval.workers.batch_player import play
 

@@ -26,7 +26,7 @@ from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.progress import kernels_to_compile
-from arena_newton.eval.workers.messages import Batch, Broke, Built, Ended, Event, Ticks, broke
+from arena_newton.eval.workers.messages import Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
 from arena_newton.policies.base import Policy
 
 __all__ = ["device_name", "parts", "play"]
@@ -52,7 +52,7 @@ def parts(options: RunOptions, factories: Factories | None) -> tuple[RunConfig, 
 
 
 def play(
-    part: Batch,
+    part: EpisodeBatch,
     config: RunConfig,
     path: Path,
     factories: Factories,

@@ -12,7 +12,7 @@ from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "Batch", "Ticks", "broke"]
+__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "EpisodeBatch", "Ticks", "broke"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Opened:
 
 
 @dataclass(frozen=True)
-class Batch:
+class EpisodeBatch:
     """Episodes of one task, tracker and mode that a process plays."""
 
     group: str

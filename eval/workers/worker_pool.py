@@ -22,7 +22,7 @@ from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.backend import PoolBackend, Process, WorkerLost
-from arena_newton.eval.workers.messages import Batch, Broke, Done, Event, Node, Opened
+from arena_newton.eval.workers.messages import Broke, Done, EpisodeBatch, Event, Node, Opened
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ class WorkerPool:
         """Let a process that waits play a batch of the run that it has opened."""
         assert worker.process is not None and worker.job is assignment.job
         config_hash = assignment.job.folder.document["config_hash"]
-        part = Batch(" ".join(assignment.group), tuple(assignment.left), assignment.worlds, config_hash)
+        part = EpisodeBatch(" ".join(assignment.group), tuple(assignment.left), assignment.worlds, config_hash)
         worker.assignment, worker.last, worker.busy = assignment, assignment.group, True
         worker.since, worker.until = time.monotonic(), self._late()
         worker.process.ask("play", part)

@@ -16,7 +16,7 @@ from arena_newton.eval.play.run_flow import begun, progress_of
 from arena_newton.eval.records.journal import Journal, read_journal
 from arena_newton.eval.workers import dealing
 from arena_newton.eval.workers.batch_player import play
-from arena_newton.eval.workers.messages import Batch, Done, Ended
+from arena_newton.eval.workers.messages import Done, Ended, EpisodeBatch
 from arena_newton.eval.workers.worker_pool import Job, Lost, Worker
 from arena_newton.physics import devices
 
@@ -47,7 +47,7 @@ class StubPool:
             if assignment is None:
                 continue
             told = []
-            part = Batch(
+            part = EpisodeBatch(
                 " ".join(assignment.group),
                 tuple(assignment.left),
                 assignment.worlds,
