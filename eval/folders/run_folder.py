@@ -95,7 +95,7 @@ class ResultsFolder:
         """Name the folder, the run and the versions of the libraries; nothing is read or written."""
         self.path, self.config, self.installed = path, config, dict(installed)
         self.document: Document
-        """Content of config.json, once the folder is settled."""
+        """Content of config.json, once the folder is prepared."""
 
     @property
     def journal(self) -> Path:
@@ -167,7 +167,7 @@ class ResultsFolder:
         except OSError as error:
             raise InputError(f"--out {self.path}: cannot be created ({error.strerror})") from None
 
-    def settle(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
+    def prepare(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
         """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
         `config` now has what tracker and policy say of themselves; `played` are the lines of the journal.

@@ -81,9 +81,9 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
         with _group(device, processes), fast_kernels(device):
             return _train(options, settings, out, device, processes, progress, checkpoint)
     except torch.OutOfMemoryError as error:
-        told = " ".join(str(error).split())[:160]
+        text = " ".join(str(error).split())[:160]
         raise ArenaError(
-            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+            f"{device}: its memory is full ({text}); try a smaller --batch-size, or fewer datasets"
         ) from None
 
 

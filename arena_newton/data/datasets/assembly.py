@@ -177,9 +177,9 @@ class _Pictures:
             raise InputError(f"{where}: cannot be copied ({type(error).__name__}: {error})") from error
         chunk, number = divmod(self.number, self.chunk_files)
         first, self.frames, self.size = self.frames, self.frames + part.frames, self.size + size
-        told: dict[str, object] = {"chunk_index": chunk, "file_index": number}
-        told |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
-        return {f"videos/{self.key}/{name}": value for name, value in told.items()}
+        facts: dict[str, object] = {"chunk_index": chunk, "file_index": number}
+        facts |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
+        return {f"videos/{self.key}/{name}": value for name, value in facts.items()}
 
     def _packets(
         self, source: av.container.InputContainer, stream: av.VideoStream, part: VideoPart, where: str
@@ -422,8 +422,8 @@ def _protocol(selections: Sequence[Selection]) -> dict[str, object] | None:
         same["backend_source"] = "+".join(dict.fromkeys(backends))
     for key in (f"{name}_reference_source" for name in REFERENCE_SOURCES):
         if any(key in block for block in known):  # a set of another tracker names none
-            said = [part for block in known for part in str(block.get(key) or "").split("+") if part]
-            same[key] = "+".join(dict.fromkeys(said)) or None
+            sources = [part for block in known for part in str(block.get(key) or "").split("+") if part]
+            same[key] = "+".join(dict.fromkeys(sources)) or None
     return same
 
 

@@ -189,7 +189,7 @@ def load_frames(
         jobs: Cores that decode, an episode each; 0: all that the process may use.
         processes: Processes that decode instead of threads; by default as `decoding_processes` says.
         network: Memory that the network needs beside the pictures [bytes] (`network_bytes`).
-        on_frames: Is told after each episode how many pictures were decoded.
+        on_frames: Receives after each episode how many pictures were decoded.
 
     Raises:
         InputError: The pictures differ in size, do not fit, or cannot be decoded; or no episode is left to train on.
