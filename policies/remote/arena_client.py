@@ -217,7 +217,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         return arena_codec.pack_begin(self._begin(world, task))
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        return arena_codec.pack_look(self._look(seen, state, image, world))
+        return arena_codec.pack_query(self._query(seen, state, image, world))
 
     def _rows(self, content: object) -> np.ndarray:
         return self.checked(arena_codec.chunk_of(_object(content), f"{self.url}/infer"))

@@ -25,7 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, compare_facts, expected_facts
-from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Look
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
 from arena_newton.policies.remote.link import RemoteError, ServerLink
@@ -359,8 +359,8 @@ class RemoteClient[Q, R](Policy):
     def _begin(self, world: int, task: str = "") -> Begin:
         return Begin(session=str(world), seed=self._seeds.get(world), task=task)
 
-    def _look(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Look:
-        return Look(
+    def _query(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Query:
+        return Query(
             state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
             image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
             task=seen.gym_id,

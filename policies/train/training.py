@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -257,7 +258,7 @@ def pair_weights(store: FrameStore, options: PolicyTrainOptions) -> list[float] 
     return [weights.get(task, 1.0) for task, _ in store.pairs]
 
 
-def camera_fit(store: FrameStore) -> str:
+def camera_fit(store: FrameStore) -> Literal["pad", "native"]:
     """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
     band = (store.height - store.width * 3 // 4) // 2
     return "pad" if band > 0 and min(store.top, store.bottom) >= BLACK_PART * band else "native"

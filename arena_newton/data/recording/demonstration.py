@@ -312,7 +312,7 @@ class DemonstrationRecorder(Recorder):
         streams = {world: self._streams[world] for world in self._acting}
         due = [w for w, stream in streams.items() if stream.looks and not len(stream.rows) % stream.looks.stride]
         if due:
-            self._filming.add(LOOKS, [streams[world].reels[LOOKS] for world in due], planes.frames(due), None)
+            self._encoder.add(LOOKS, [streams[world].videos[LOOKS] for world in due], planes.frames(due), None)
 
     def _taken(self, pictures: torch.Tensor) -> torch.Tensor:
         """Pictures of the worlds that act."""
@@ -552,9 +552,9 @@ def _film_fields(name: str, stream: VideoStream, film: FilmFacts, rows: int) -> 
     }
 
 
-def _check_frames(reel: Reel, film: FilmFacts, frames: int) -> None:
+def _check_frames(stream: VideoStream, film: FilmFacts, frames: int) -> None:
     if film.frames != frames:
-        raise ArenaError(f"{reel.video}: {film.frames} frames instead of {frames}")
+        raise ArenaError(f"{stream.video}: {film.frames} frames instead of {frames}")
 
 
 def _split(rows: Sequence[np.ndarray], widths: Sequence[int]) -> list[np.ndarray]:
