@@ -84,11 +84,11 @@ def read_options():
 
     read, kept = ParserSpecification.from_callable_or_type, {}
 
-    def read_once(kind, **given):
-        if given["parent_classes"] or not isinstance(kind, type):
-            return read(kind, **given)
-        key = kind, repr(given["default_instance"])
-        return kept[key] if key in kept else kept.setdefault(key, read(kind, **given))
+    def read_once(f, **given):
+        if given["parent_classes"] or not isinstance(f, type):
+            return read(f, **given)
+        key = f, repr(given["default_instance"])
+        return kept[key] if key in kept else kept.setdefault(key, read(f, **given))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ParserSpecification, "from_callable_or_type", staticmethod(read_once))

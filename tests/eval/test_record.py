@@ -152,7 +152,7 @@ def test_kills_lose_at_most_what_was_running(brief, tmp_path, parts):
     """Killed while it writes and resumed by another process, a recording has the bytes of a whole one."""
     folder, began = tmp_path / "killed", time.monotonic()
     run = Child("quick_worlds", ["record", *BRIEF, "--worlds", "2", "--out", str(folder)])
-    while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 120 and run.poll() is None:
+    while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 300 and run.poll() is None:
         time.sleep(0.01)
     run.kill()
     assert run.wait() == -signal.SIGKILL, run.printed()
