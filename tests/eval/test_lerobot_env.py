@@ -130,14 +130,14 @@ def test_an_experts_actions_succeed_as_in_our_runner(monkeypatch, checkpoint, bo
 
 def test_a_network_decides_as_in_our_runner(monkeypatch, checkpoint, watched_worlds, tmp_path):
     """A random ACT, chunks and pictures included: every tick is the same; LeRobot's own recording has our columns."""
-    hashes, results = watched_rollout(watched_worlds, "football", 2, 2, NetworkPolicy(checkpoint), max_steps=23)
+    hashes, results = watched_rollout(watched_worlds, "football", 2, 2, NetworkPolicy(checkpoint), max_steps=11)
     assert len({result.margin for result in results}) == 2
-    flags = "--env.episode_length=23", "--eval.recording=true"
+    flags = "--env.episode_length=11", "--eval.recording=true"
     info = evaluate(monkeypatch, checkpoint, tmp_path, "football", *flags)
-    assert WatchedEnv.history == hashes and all(len(ticks) == 50 + 23 for ticks in hashes.values())
+    assert WatchedEnv.history == hashes and all(len(ticks) == 50 + 11 for ticks in hashes.values())
     assert info["overall"]["pc_success"] == 0.0
     recorded = LeRobotDataset("eval_recording_env_1", root=tmp_path / "recordings" / "football_0" / "env_1")
-    assert recorded.num_frames == 23 and recorded.fps == 50
+    assert recorded.num_frames == 11 and recorded.fps == 50
     assert {"observation.state", "observation.images.front", "action"} < set(recorded.features)
     assert recorded[0]["task"] == "Kick the soccer ball into the goal."
 
