@@ -47,7 +47,7 @@ def checkpoint(tmp_path_factory):
 
 
 def play(protocol, *episodes, seconds=1.0):
-    """What a protocol did: episodes as outcome and actions."""
+    """Episodes of a protocol, as outcome and actions."""
     made = [
         ProtocolEpisode(f"s0/r{number}", outcome, outcome, len(actions), 0.5, np.asarray(actions, np.float32))
         for number, (outcome, actions) in enumerate(episodes)
@@ -235,7 +235,7 @@ def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch,
 
 
 def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_path):
-    """What LeRobot records of a policy with a task vector has it as a column."""
+    """LeRobot's recording of a policy with a task vector has it as a column."""
     flags = ["--eval.n_episodes=1", "--eval.batch_size=1", "--seed=0", "--env.episode_length=3"]
     argv(monkeypatch, checkpoint, *flags, f"--output_dir={tmp_path / 'out'}", "--eval.recording=true")
     eval_main()
