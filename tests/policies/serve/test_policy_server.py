@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from served_policies import Fails, Remembers, TurnsV4, query, state, together
 
-from arena_newton.data.readers.label_protocols import decode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy
