@@ -303,6 +303,7 @@ class ArenaEnv:
             task=self.spec.name,
             gym_id=self.spec.gym_id,
             instruction=self.spec.instruction,
+            tracker=self.tracker.name,
         )
 
     def render(self, camera: Camera, mask: np.ndarray | None = None) -> torch.Tensor:

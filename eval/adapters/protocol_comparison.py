@@ -259,7 +259,8 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
             spec = f"{protocol}:{checkpoint}"
             if protocol in SERVED:
                 served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", protocol]
-                served += ["--port", "0", "--task", options.task, "--device", options.device]
+                served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
+                served += ["--device", options.device]
                 commands.append([sys.executable, "-m", *served])
                 spec = stack.enter_context(_server(protocol, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))

@@ -14,8 +14,8 @@ from typing import TypedDict
 from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.html_report import FOLDER
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 from arena_newton.pages.html import EMBEDDED, render
 from arena_newton.pages.tables import Table, escaped

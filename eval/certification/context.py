@@ -23,7 +23,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
 from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import Json
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import counted
 from arena_newton.rules import seeding
 

@@ -13,9 +13,9 @@ from arena_newton.errors import InputError
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
     from arena_newton.eval.studies.action_map import ActionMap, Separation
     from arena_newton.eval.studies.predicted_actions import DatasetObservations
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.policies.base import Policy
 
 __all__ = ["TsneOptions", "run"]

@@ -20,9 +20,9 @@ from arena_newton.eval.records import document as documents
 from arena_newton.eval.records.document import CONFIG_FILE, Document, read_document
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import JsonObject, check_types
 from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import plain_text
 
 __all__ = [
@@ -43,7 +43,7 @@ EPISODES = "episodes"
 """Folder of the files of recorded episodes."""
 SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
 """Folders that a run writes inside its own."""
-RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
+RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth", "record_looks")
 """Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
 """File with the trace of a break, for a later look."""

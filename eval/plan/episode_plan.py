@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED, JsonObject
+from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import MODES
 

@@ -144,6 +144,8 @@ class Recording:
     """Size of their pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
+    record_looks: int = 0
+    """Write what every fifth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
 
 
 @dataclass(frozen=True)
@@ -301,6 +303,9 @@ class _Demonstrations:
     """Size of the pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     depth: bool = False
     """Write the depth of each picture too, float16 [m]."""
+    looks: int = 0
+    """Write what every fifth picture shows and its light under so many second lights, 1 or 2, so that a training can
+    change its looks (docs/recording.md)."""
 
 
 @dataclass(frozen=True)

@@ -12,24 +12,9 @@ from typing import Annotated, Literal, TypedDict
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.records.journal import JOURNAL_FILE, ContradictionError, EpisodeRecord, contradiction
-from arena_newton.eval.records.schema import (
-    MAX_CONFIG_BYTES,
-    MAX_EPISODES,
-    Count,
-    Facts,
-    Fit,
-    Json,
-    JsonObject,
-    Name,
-    Positive,
-    Seed,
-    fit,
-    is_name,
-    parse,
-    read_regular,
-    shown,
-)
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_EPISODES, Count, Positive, Seed
 from arena_newton.eval.records.sharding import dealt, read_shard
+from arena_newton.files.stored_json import Facts, Fit, Json, JsonObject, Name, fit, is_name, parse, read_regular, shown
 from arena_newton.rules import seeding
 
 __all__ = [

@@ -14,7 +14,7 @@ from arena_newton.cli.flags import shell_command, typed
 from arena_newton.eval.plan.options import Remote, flags_of
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import plain
 
 __all__ = [

@@ -15,10 +15,11 @@ from arena_newton import policies, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_NAME, JsonObject, parse, read_regular
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.eval.reports.progress import simulated
 from arena_newton.eval.suites.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
 from arena_newton.eval.suites.suite_records import SuiteCell
+from arena_newton.files.stored_json import MAX_NAME, JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, CheckpointFacts, checkpoint_folder

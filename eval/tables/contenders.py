@@ -10,10 +10,10 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, changed_conditions, is_complete, width_rule
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json, shown
 from arena_newton.eval.statistics.comparison import Contender
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, read_folder, runs_of
+from arena_newton.files.stored_json import Json, shown
 from arena_newton.files.text import counted, plain_text
 from arena_newton.tasks.semantic_mode import semantic_note
 

@@ -14,8 +14,8 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, check_whole_plan, is_complete, load_run
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json
 from arena_newton.eval.suites.suite_records import SuiteCell, SuitePlan, load_cell, read_suite
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import counted, plain, plain_text
 from arena_newton.rules import seeding
 

@@ -24,9 +24,9 @@ from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_parts
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.progress import kernels_to_compile
 from arena_newton.eval.workers.messages import Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.policies.base import Policy
 
 __all__ = ["device_name", "parts", "play"]

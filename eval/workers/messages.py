@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from arena_newton.errors import InputError
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import StorageError
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 

@@ -21,10 +21,10 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
-from arena_newton.eval.records.schema import Json, JsonObject, shown
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
+from arena_newton.files.stored_json import Json, JsonObject, shown
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["MergedRun", "merge"]

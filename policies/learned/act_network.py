@@ -39,7 +39,7 @@ class ActSizes:
     state: int
     """Numbers of the state."""
     tasks: int
-    """Width of the task vector; 0: none."""
+    """Width of the vector of task and tracker; 0: none."""
     actions: int
     """Numbers of an action."""
     chunk_size: int

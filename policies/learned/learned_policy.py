@@ -87,7 +87,7 @@ class LearnedPolicy(Policy):
         # Who does not ask stands, in v3.1, of which orientations must name a rotation.
         filler = torch.from_numpy(STAND_ACTION) if self.labels == "v3.1" else torch.zeros(ACTION_WIDTH)
         actions = filler.to(state.device).repeat(worlds, self.chunk_size, 1)
-        vector = self._task_vector(observation.task, device)
+        vector = self._vector(observation, device)
         size = CPU_ROWS if device.type == "cpu" else CUDA_ROWS
 
         @torch.inference_mode()
@@ -127,6 +127,7 @@ class LearnedPolicy(Policy):
             "labels": facts.labels,
             "realign": facts.realign,
             "task_vector": list(facts.task_vector),
+            **({"tracker_vector": list(facts.tracker_vector)} if facts.tracker_vector else {}),
             "picture": [facts.width, facts.height, facts.fit],
             "predicted": self.checkpoint.sizes.chunk_size,
             "replan": self.chunk_size,
@@ -161,11 +162,11 @@ class LearnedPolicy(Policy):
             raise InputError(f"policy {self.name}: expected pictures of {list(size)}, was given {given}")
         return pictures
 
-    def _task_vector(self, task: str, device: torch.device) -> torch.Tensor | None:
-        """The one-hot vector of the task; None for policies without one."""
-        self.check_task(task)
-        known = self.checkpoint.facts.task_vector
-        return torch.tensor([float(name == task) for name in known], device=device) if known else None
+    def _vector(self, seen: Observation, device: torch.device) -> torch.Tensor | None:
+        """The one-hot vector of task and tracker; None for policies without one."""
+        self.check_task(seen.task)
+        numbers = self.checkpoint.facts.vector(seen.task, seen.tracker)
+        return torch.tensor(numbers, device=device) if numbers else None
 
 
 Queries = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterable[torch.Tensor]]

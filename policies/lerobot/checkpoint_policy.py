@@ -130,7 +130,7 @@ class LeRobotPolicy(Policy):
         self._glimpse(observation, serving, device, memory)
         querying = [world for world in serving if not memory.waits(world)]
         rows = CPU_ROWS if device.type == "cpu" else CUDA_ROWS[FAMILY_TYPES[self.checkpoint.type]]
-        vector = self._task_vector(observation.task, device)
+        vector = self._vector(observation, device)
         for first in range(0, len(querying), rows):
             some = querying[first : first + rows]
             chunks = self._predict(network, memory, some, rows, vector, observation.instruction)
@@ -166,6 +166,7 @@ class LeRobotPolicy(Policy):
             "labels": facts.labels,
             "realign": facts.realign,
             "task_vector": list(facts.task_vector),
+            **({"tracker_vector": list(facts.tracker_vector)} if facts.tracker_vector else {}),
             "picture": picture,
             "prepared": checkpoint.preparation is not None,
             "observations": checkpoint.observations,
@@ -252,17 +253,16 @@ class LeRobotPolicy(Policy):
         """Rows [rows, ticks, ...], or [rows, ...] of the one tick."""
         return torch.stack([torch.stack(list(query)) if several else query[-1] for query in queries])
 
-    def _task_vector(self, task: str, device: torch.device) -> torch.Tensor | None:
-        """The one-hot vector of the task; None for policies without one.
+    def _vector(self, seen: Observation, device: torch.device) -> torch.Tensor | None:
+        """The one-hot vector of task and tracker; None for policies without one.
 
         Raises:
             InputError: The policy does not know the task.
         """
-        known = self.checkpoint.facts.task_vector
-        if not known:
+        if not self.checkpoint.facts.task_vector:
             return None
-        self.check_task(task)
-        return torch.tensor([float(name == task) for name in known], device=device)
+        self.check_task(seen.task)
+        return torch.tensor(self.checkpoint.facts.vector(seen.task, seen.tracker), device=device)
 
     def _filler(self, worlds: int, length: int, device: torch.device) -> torch.Tensor:
         """Chunks of worlds that do not ask: standing in v3.1, of which orientations must name a rotation."""

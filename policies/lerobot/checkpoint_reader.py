@@ -21,7 +21,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
+from arena_newton.files.stored_json import read_object
+from arena_newton.files.untrusted_files import check_size, file_digest
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -149,7 +150,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     if not (folder / WEIGHTS).is_file():
         raise InputError(f"{folder}: holds no {WEIGHTS}; weights in other files, such as pickles, are not read")
     check_size(folder / WEIGHTS, MOST_WEIGHTS)
-    content = _json(folder / CONFIG_FILE)
+    content = read_object(folder / CONFIG_FILE, MOST_JSON)
     kind = content.pop("type", None)
     known = PreTrainedConfig.get_known_choices()
     if not isinstance(kind, str) or kind not in known:
@@ -175,16 +176,6 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     check_layers(folder / WEIGHTS, kind, config)
     digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
-
-
-def _json(path: Path) -> dict[str, object]:
-    try:
-        content = json.loads(read_bytes(path, MOST_JSON))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
-    return content
 
 
 def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tuple[PreTrainedConfig, tuple[str, ...]]:
@@ -231,7 +222,7 @@ def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
             raise InputError(
                 f"{folder}: holds no {name}; LeRobot's migrate_policy_normalization.py makes one for old checkpoints"
             )
-        steps = _json(path).get("steps")
+        steps = read_object(path, MOST_JSON).get("steps")
         if not isinstance(steps, list):
             raise InputError(f"{path}: steps is {type(steps).__name__}, expected a list")
         for index, step in enumerate(steps):
@@ -298,13 +289,14 @@ def _features(
         if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
             picture = (int(shape[1]), int(shape[2]))
             continue
-        if given == TASK_VECTOR and facts.task_vector and shape == (len(facts.task_vector),):
+        if given == TASK_VECTOR and facts.task_vector and shape == (facts.vector_width,):
             continue
         if name.startswith("observation.images.empty_camera_") and config.type == "pi05":
             continue  # the network fills it with an empty picture itself
         if given == TASK_VECTOR:
-            text = f"{FACTS_FILE} names {len(facts.task_vector)} tasks for it"
-            raise InputError(f"{path}: input {name} is {_shape(feature)}, but {text}")
+            trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
+            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
+            raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
         known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
     for name in (STATE, *((TASK_VECTOR,) if facts.task_vector else ())):

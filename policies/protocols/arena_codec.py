@@ -12,6 +12,7 @@ import binascii
 import json
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from arena_newton.policies.protocols.wire_error import WireError
 __all__ = [
     "CLIENT_HEADER",
     "MAX_WORLD",
+    "chunk_of",
     "pack_begin",
     "pack_begun",
     "pack_chunk",
@@ -170,8 +172,18 @@ def unpack_chunk(body: bytes, where: str) -> np.ndarray:
     content = _object(body, where)
     if "error" in content:
         raise WireError(f"{where}: the server says {plain_text(content['error'], 200)}")
-    rows = content.get("action_chunk", content.get("action"))
-    if not isinstance(rows, list):
+    return chunk_of(content, where)
+
+
+def chunk_of(content: Mapping[str, object], where: str) -> np.ndarray:
+    """The chunk of a reply's object, float32, shape [n, 40].
+
+    Raises:
+        WireError: It holds none.
+    """
+    rows = content.get("action_chunk")
+    rows = content.get("action") if rows is None else rows
+    if not isinstance(rows, list) or not rows:
         raise WireError(f"{where}: the reply holds neither action_chunk nor action as lists of numbers")
     return read_actions(rows, where)
 

@@ -25,13 +25,13 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, compare_facts, expected_facts
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
 from arena_newton.policies.remote.link import RemoteError, ServerLink
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE, STATE_WIDTH
 
 __all__ = [
-    "MAX_CHUNK",
     "MAX_FAILURES",
     "MAX_REPLY",
     "RemoteClient",
@@ -40,8 +40,6 @@ __all__ = [
 
 MAX_REPLY = 4 * 2**20
 """Longest reply for one world that is read [bytes]."""
-MAX_CHUNK = 4096
-"""Longest chunk that is accepted [actions]."""
 MAX_CONNECTIONS = 32
 """Requests that are under way at once."""
 MAX_FAILURES = 10
@@ -330,15 +328,16 @@ class RemoteClient[Q, R](Policy):
         self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
         """Chunks and errors of the worlds that need a new one."""
-        if not self.batched:
-            requests = {world: self._request(seen, state, image, world) for world in worlds}
-            return self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
-        # A server may refuse a batch for one row of it.
+        # A server may refuse a batch for one row of it, and JSON has no such numbers.
         broken = [world for world in worlds if not np.isfinite(state[world]).all()]
         errors = dict.fromkeys(broken, "the state holds a number that is not finite")
         worlds = [world for world in worlds if world not in errors]
         if not worlds:
             return {}, errors
+        if not self.batched:
+            requests = {world: self._request(seen, state, image, world) for world in worlds}
+            got, failed = self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
+            return got, errors | failed
         request = self._batch(seen, state, image, worlds)
         got, failed = self._ask(
             self.infer_kind,
@@ -356,6 +355,21 @@ class RemoteClient[Q, R](Policy):
             except RemoteError as error:
                 errors[world] = str(error)
         return chunks, errors
+
+    def _begin(self, world: int, task: str = "") -> Begin:
+        return Begin(session=str(world), seed=self._seeds.get(world), task=task)
+
+    def _query(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Query:
+        return Query(
+            state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
+            image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
+            task=seen.gym_id,
+            instruction=seen.instruction,
+            session=str(world),
+            seed=self._seeds.get(world),
+            step=self._steps.get(world, 0),
+            robot_type=self.protocol.robot_type,
+        )
 
     def describe(self) -> Json:
         """Address, order of the requests, and what the server says of itself; complete after `check`."""
@@ -401,8 +415,8 @@ class RemoteClient[Q, R](Policy):
             raise RemoteError(f"{where}: an action holds a number that is too large") from error
         if actions.ndim != 2 or not len(actions):
             raise RemoteError(f"{where}: actions of shape {list(actions.shape)}, expected [n, {ACTION_WIDTH}]")
-        if len(actions) > MAX_CHUNK:
-            raise RemoteError(f"{where}: a chunk of {len(actions)} actions, expected at most {MAX_CHUNK}")
+        if len(actions) > LONGEST_CHUNK:
+            raise RemoteError(f"{where}: a chunk of {len(actions)} actions, expected at most {LONGEST_CHUNK}")
         return actions
 
     def _ask[T](

@@ -26,7 +26,6 @@ from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import cause
 from arena_newton.policies.remote.client import MAX_REPLY, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink
-from arena_newton.robot.canonical import STATE_WIDTH
 
 __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
 
@@ -278,21 +277,6 @@ class SocketClient(RemoteClient[SocketRequest, object]):
                 raise self.refusal(RemoteError(text if self.url in text else f"{self.url}: {text}")) from None
         self._checked = True
         return self.greeting
-
-    def _begin(self, world: int, task: str = "") -> Begin:
-        return Begin(session=str(world), seed=self._seeds.get(world), task=task)
-
-    def _query(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Query:
-        return Query(
-            state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
-            image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
-            task=seen.gym_id,
-            instruction=seen.instruction,
-            session=str(world),
-            seed=self._seeds.get(world),
-            step=self._steps.get(world, 0),
-            robot_type=self.protocol.robot_type,
-        )
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> SocketRequest:
         query = self._query(seen, state, image, world)

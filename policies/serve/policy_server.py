@@ -164,6 +164,7 @@ class PolicyServer:
         max_batch_size: int = 16,
         max_wait: float = 0.02,
         max_sessions: int = 64,
+        tracker: str = "",
         device: str | torch.device = "cpu",
     ):
         """Take the policy; `start` begins to serve.
@@ -173,9 +174,10 @@ class PolicyServer:
             max_batch_size: Most queries in one call of the policy.
             max_wait: How long the first query of a batch waits for others [s].
             max_sessions: Rows of the policy, so most episodes at once.
+            tracker: As of `Observation`.
             device: Torch device of what the policy sees.
         """
-        self.policy, self.device = policy, torch.device(device)
+        self.policy, self.tracker, self.device = policy, tracker, torch.device(device)
         self.max_batch_size, self.max_wait, self.max_sessions = max_batch_size, max_wait, max_sessions
         self.counts = ServerCounts()
         self.protocol = protocol(policy.labels or "v3.1")
@@ -523,7 +525,8 @@ class PolicyServer:
     def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:
         mask = np.zeros(self.max_sessions, dtype=bool)
         mask[list(rows)] = True
-        return Observation(self._state, self._image, mask, task.name, task.gym_id, task.instruction)
+        said = task.name, task.gym_id, task.instruction, self.tracker
+        return Observation(self._state, self._image, mask, *said)
 
     def _act(self, task: _Task, asking: Sequence[tuple[_Job, _Session]]) -> None:
         """One call of the policy."""

@@ -62,6 +62,7 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         max_batch_size=options.max_batch_size,
         max_wait=options.max_wait,
         max_sessions=options.max_sessions,
+        tracker=options.tracker,
         device=device,
     )
     try:

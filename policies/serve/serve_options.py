@@ -38,6 +38,8 @@ class ServeOptions:
     task: str | None = None
     """Task of the query before the first one, by which everything is loaded and compiled; one that the policy does when
     none is named."""
+    tracker: str = ""
+    """Tracker of the robots, for a policy that is given its name; unknown by default: no protocol says it."""
     replan: int | None = None
     """Actions of a chunk that are executed before the next query, of a checkpoint; its own number by default."""
     ensemble: bool = False

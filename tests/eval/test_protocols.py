@@ -47,7 +47,7 @@ def checkpoint(tmp_path_factory):
 
 
 def play(protocol, *episodes, seconds=1.0):
-    """Episodes of a protocol, as outcome and actions."""
+    """Episodes played through a protocol, as outcome and actions."""
     made = [
         ProtocolEpisode(f"s0/r{number}", outcome, outcome, len(actions), 0.5, np.asarray(actions, np.float32))
         for number, (outcome, actions) in enumerate(episodes)
@@ -244,13 +244,15 @@ def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_pat
 
 
 def test_the_vector_names_the_task():
-    """Every world is told its task, under LeRobot's name and under that of datasets; the spaces say so."""
-    config = ArenaNewtonEnv(task="vis_navi", engine="mujoco", device="cpu", task_vector="boxing,vis_navi", labels="v4")
+    """Every world is told task and tracker, under LeRobot's name and under that of datasets; the spaces say so."""
+    vectors = {"task_vector": "boxing,vis_navi", "tracker_vector": "sonic,twist2"}
+    config = ArenaNewtonEnv(task="vis_navi", engine="mujoco", device="cpu", labels="v4", **vectors)
+    assert config.features["observation.environment_state"].shape == (5,)
     batch = config.create_envs(2)["vis_navi"][0]
     assert isinstance(batch, V4VectorEnv)
     seen, _ = batch.reset(seed=[0, 1])
     for name in ("environment_state", "observation.environment_state"):
-        assert torch.equal(torch.from_numpy(seen[name]), torch.tensor([[0.0, 1.0]] * 2))
+        assert torch.equal(torch.from_numpy(seen[name]), torch.tensor([[0.0, 1.0, 0.0, 1.0, 0.0]] * 2))
     assert batch.observation_space.contains(seen)
     batch.close()
 

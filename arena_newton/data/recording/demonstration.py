@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +17,9 @@ import warp as wp
 
 from arena_newton.data.recording.encoder_pool import EncoderPool
 from arena_newton.data.recording.encoding import EncoderThreads, Pictured, VideoEncoder, VideoStream
-from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
+from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
 from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
+from arena_newton.data.recording.look_planes import LookPlanes
 from arena_newton.errors import ArenaError
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
@@ -28,6 +30,7 @@ from arena_newton.robot.rotations import matrix_from_quat, quat_apply, quat_conj
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
+    from arena_newton.data.readers.looks import Looks
     from arena_newton.interfaces import EpisodeResult, Observation, World
     from arena_newton.pictures.settings import CameraConfig
 
@@ -35,6 +38,8 @@ __all__ = ["DemonstrationRecorder", "RecordedEpisode", "SavedEpisode", "episode_
 
 FPS = round(1 / g1.TICK)
 """Frames per second: one a tick."""
+LOOKS = "looks"
+"""Name of the film of looks among those of the cameras; it is of the head camera's pictures."""
 WAITING_EPISODES = 8
 """Ended episodes whose files are not written yet, beside one per world: more of them wait for the disk."""
 
@@ -99,7 +104,8 @@ class _Stream:
     initial: dict[str, np.ndarray]
     """Fields of the reset."""
     videos: dict[str, VideoStream]
-    """Its films by camera."""
+    """Its films by camera, and that of its looks."""
+    looks: Looks | None = None
     heading: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     """Packed rows: the beginning of a tick, then what was executed in it."""
@@ -125,6 +131,7 @@ class DemonstrationRecorder(Recorder):
         *,
         cameras: Mapping[str, CameraConfig] | None = None,
         depth: bool = False,
+        looks: int = 0,
         seeds: str | None = None,
         only_success: bool = False,
         facts: Mapping[str, object] | None = None,
@@ -139,6 +146,7 @@ class DemonstrationRecorder(Recorder):
             folder: Where `<label>.npz` and `videos/` are written.
             cameras: Camera as datasets name it (`episode.CAMERAS`) → its picture; none: states and actions only.
             depth: Record the depth of each picture too, float16 [m].
+            looks: Second lights of an episode (`readers.looks`), with the camera `front`; 0: no looks.
             seeds: Range of the seeds, where the seed itself does not tell (`seeding.TELEOPERATION`).
             only_success: Write successes only.
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
@@ -149,6 +157,8 @@ class DemonstrationRecorder(Recorder):
             finishing: Makes the arrays that are written from those that were recorded.
         """
         self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
+        self.looks = looks
+        self._planes: LookPlanes | None = None
         self.seeds, self.only_success, self.finishing = seeds, only_success, finishing
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)
         self._env: World | None = None
@@ -180,11 +190,14 @@ class DemonstrationRecorder(Recorder):
         self._env = env
         self._described = env.describe()
         front = self.cameras.get("front")
-        # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
-        same = env.camera is not None and front == env.camera_config and not self.depth
+        # Surfaces of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
+        same = env.camera is not None and front == env.camera_config and not self.depth and not self.looks
         self._shared = "front" if same else None
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
         pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
+        if self.looks:
+            self._planes = LookPlanes(env, self._views["front"], self.looks)
+            pictured[LOOKS] = dataclasses.replace(pictured["front"], depth=False)
         self._encoder.bind(pictured, torch.device(env.torch_device))
         scene = env.scene
         self._bodies = {}
@@ -242,7 +255,12 @@ class DemonstrationRecorder(Recorder):
             video = self.folder / VIDEO_FOLDER / f"{label}_{name}_rgb.mp4"
             depth = self.folder / f"{label}_{name}_depth.raw{PARTIAL}"
             videos[name] = self._encoder.open(worker, video, depth, FPS)
-        self._streams[world] = _Stream(episode, worker, initial, videos)
+        looks = None
+        if self._planes is not None:
+            looks = self._planes.begin(world, episode.episode_seed)
+            film = looks_film(videos["front"].video)
+            videos[LOOKS] = self._encoder.open(worker, film, film, FPS / looks.stride, lossless=True)
+        self._streams[world] = _Stream(episode, worker, initial, videos, looks)
         self._videos = {}
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
@@ -267,6 +285,8 @@ class DemonstrationRecorder(Recorder):
                 stream.heading = float(self._heading[world])
         for name, camera in self._views.items():
             self._film(env, name, camera, mask, observation)
+            if name == "front" and self._planes is not None:
+                self._film_looks(self._planes)
 
     def _act(self, worlds: list[int]) -> None:
         """Set the worlds that act in this tick; the choice of films follows only where it changes."""
@@ -286,6 +306,13 @@ class DemonstrationRecorder(Recorder):
         pictures = self._taken(wp.to_torch(camera.image))
         depths = self._taken(camera.distance_picture()).half() if self.depth else None
         self._encoder.add(name, self._videos[name], pictures, depths)
+
+    def _film_looks(self, planes: LookPlanes) -> None:
+        """Hand over the looks of the pictures that the head camera has just rendered, where a frame is due."""
+        streams = {world: self._streams[world] for world in self._acting}
+        due = [w for w, stream in streams.items() if stream.looks and not len(stream.rows) % stream.looks.stride]
+        if due:
+            self._encoder.add(LOOKS, [streams[world].videos[LOOKS] for world in due], planes.frames(due), None)
 
     def _taken(self, pictures: torch.Tensor) -> torch.Tensor:
         """Pictures of the worlds that act."""
@@ -442,8 +469,12 @@ class DemonstrationRecorder(Recorder):
         fields |= stream.initial
         fields["episode_object_seed"] = np.uint64(episode.object_seed)
         fields["episode_object_seed_source"] = np.str_("arena_episode_seed")
-        for name, film in films.items():
-            if film is not None:
+        looks = stream.looks
+        if looks is not None and (made := films.get(LOOKS)):
+            _check_frames(stream.videos[LOOKS], made, looks.frames(rows))
+            fields[f"arena_{vision('front', 'looks')}"] = np.str_(json.dumps(looks.plain()))
+        for name in self.cameras:
+            if (film := films[name]) is not None:
                 fields |= _film_fields(name, stream.videos[name], film, rows)
         fields |= {
             "arena_state": state,
@@ -477,7 +508,7 @@ class DemonstrationRecorder(Recorder):
         """Drop what is unfinished; no partial file stays."""
         self._discard()
         self._encoder.close()
-        self._env, self._views = None, {}
+        self._env, self._views, self._planes = None, {}, None
 
     def _discard(self) -> None:
         self._encoder.wait()
@@ -502,8 +533,7 @@ def _film_fields(name: str, stream: VideoStream, film: FilmFacts, rows: int) -> 
     Raises:
         ArenaError: The film has another number of pictures.
     """
-    if film.frames != rows:
-        raise ArenaError(f"{stream.video}: {film.frames} frames for {rows} rows")
+    _check_frames(stream, film, rows)
     codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0, "mbtree": 0}
     found: dict[str, np.ndarray | np.generic] = {
         vision(name, "storage_format"): np.str_("video_v1"),
@@ -520,6 +550,11 @@ def _film_fields(name: str, stream: VideoStream, film: FilmFacts, rows: int) -> 
         f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
         f"arena_{vision(name, 'histogram')}": film.histogram,
     }
+
+
+def _check_frames(stream: VideoStream, film: FilmFacts, frames: int) -> None:
+    if film.frames != frames:
+        raise ArenaError(f"{stream.video}: {film.frames} frames instead of {frames}")
 
 
 def _split(rows: Sequence[np.ndarray], widths: Sequence[int]) -> list[np.ndarray]:

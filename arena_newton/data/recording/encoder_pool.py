@@ -13,10 +13,8 @@ import itertools
 import os
 import select
 import selectors
-import signal
 import socket
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -41,7 +39,7 @@ from arena_newton.data.recording.episode_film import FilmFacts
 from arena_newton.errors import ArenaError
 from arena_newton.files.interrupts import Uninterrupted
 from arena_newton.files.own_files import PARTIAL
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended, start_module
 from arena_newton.files.pinned_memory import pin, unpin
 
 __all__ = ["EncoderPool"]
@@ -147,15 +145,8 @@ class EncoderPool(VideoEncoder):
         ours, theirs = socket.socketpair()
         with theirs:
             files = theirs.fileno(), *(slots.fd for slots in self._cameras.values())
-            # A session of its own: Ctrl-C is the recorder's, which still needs the films.
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", PROGRAM, str(theirs.fileno()), str(os.getpid())],
-                pass_fds=files,
-                env=environment(one_thread=True),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                start_new_session=True,
-            )
+            variables = environment(one_thread=True)
+            process = start_module(PROGRAM, theirs.fileno(), os.getpid(), files=files, variables=variables)
         ours.setblocking(False)
         worker = _Worker(number, process, ours)
         self._selector.register(ours, selectors.EVENT_READ, worker)
@@ -172,10 +163,11 @@ class EncoderPool(VideoEncoder):
         """The episode brings no more pictures."""
         self._open[worker] -= 1
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> VideoStream:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
         """A film of an episode."""
         stream = VideoStream(next(self._numbers), worker, video, depth)
         about = {"film": stream.number, "video": str(video), "depth": str(depth), "fps": float(fps)}
+        about |= {"lossless": lossless}
         with self._whole:
             self._send(self._workers[worker], about)
         return stream
@@ -361,13 +353,7 @@ class EncoderPool(VideoEncoder):
             return
         worker.alive = False
         self._selector.unregister(worker.connection)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            worker.process.wait(PATIENCE)
-        code = worker.process.returncode or 0
-        how = f"exit code {code}"
-        if code < 0:
-            how = f"{signal.Signals(-code).name}{'; out of memory?' if -code == signal.SIGKILL else ''}"
-        reason = f"a process that encodes pictures ended ({how})"
+        reason = f"a process that encodes pictures ended ({how_it_ended(worker.process, PATIENCE)})"
         self._errors.append(ChildProcessError(errno.ECHILD, reason))
         for slots in self._cameras.values():
             for users in slots.users:

@@ -118,8 +118,14 @@ class _Films:
         match message:
             case {"memory": memories}:
                 self._memories = [SlotMemory(*numbers) for numbers in cast("list[list[int]]", memories)]
-            case {"film": int(number), "video": str(video), "depth": str(depth), "fps": float(fps)}:
-                self._films[number] = Film(Path(video), Path(depth), fps)
+            case {
+                "film": int(number),
+                "video": str(video),
+                "depth": str(depth),
+                "fps": float(fps),
+                "lossless": bool(exact),
+            }:
+                self._films[number] = Film(Path(video), Path(depth), fps, exact)
             case {"camera": int(camera), "slot": int(slot), "rows": rows}:
                 memory = self._memories[camera]
                 pictures, depths = memory.pictures[slot], memory.depths

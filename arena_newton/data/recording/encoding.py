@@ -110,8 +110,8 @@ class VideoEncoder(abc.ABC):
         """The episode brings no more pictures."""
 
     @abc.abstractmethod
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> VideoStream:
-        """A film of an episode."""
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
+        """A film of an episode; `lossless` keeps every byte of its pictures."""
 
     @abc.abstractmethod
     def add(
@@ -307,10 +307,10 @@ class EncoderThreads(VideoEncoder):
         """The episode brings no more pictures."""
         self._encoders.leave(worker)
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> VideoStream:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
         """A film of an episode."""
         self._opened += 1
-        return VideoStream(self._opened, worker, video, depth, Film(video, depth, fps))
+        return VideoStream(self._opened, worker, video, depth, Film(video, depth, fps, lossless))
 
     def add(
         self, camera: str, streams: Sequence[VideoStream], pictures: torch.Tensor, depths: torch.Tensor | None

@@ -19,6 +19,7 @@ from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE, write_actions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.policies.label_reader import measured_yaw
+from arena_newton.policies.lerobot.checkpoint_facts import vector_of
 
 if TYPE_CHECKING:
     from typing import Any
@@ -59,10 +60,11 @@ class PolicyVectorEnv(ArenaVectorEnv):
         if known and task not in known:
             raise InputError(f"--env.task {task}: the policy was trained on {', '.join(known)}")
         super().__init__(task, num_envs, **cast("dict[str, Any]", options))
-        vector = np.array([float(name == task) for name in known], np.float32)
+        trackers = self._policy.tracker_vector if known else ()
+        vector = np.array(vector_of(known, trackers, task, self.env.tracker.name), np.float32)
         self._vectors = {name: np.tile(vector, (num_envs, 1)) for name in VECTOR_KEYS} if known else {}
         if self._vectors:
-            box = spaces.Box(0.0, 1.0, (len(known),), np.float32)
+            box = spaces.Box(0.0, 1.0, vector.shape, np.float32)
             parts = cast("spaces.Dict", self.single_observation_space).spaces
             self.single_observation_space = spaces.Dict(parts | dict.fromkeys(VECTOR_KEYS, box))
             self.observation_space = batch_space(self.single_observation_space, num_envs)

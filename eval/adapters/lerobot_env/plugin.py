@@ -92,6 +92,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Of v4: ticks between two queries of the policy, at which `realign` measures the heading: its n_action_steps."""
     task_vector: str | None = None
     """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
+    tracker_vector: str | None = None
+    """Trackers in the order of the numbers that follow in it, after which one is that of any other; the policy's."""
     episodes: str | None = None
     """Folder that gets what LeRobot's files leave out: a line per episode, and its actions for `replay:`."""
 
@@ -116,6 +118,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             realign=declared.realign if self.realign is None else self.realign,
             query_ticks=declared.query_ticks if self.query_ticks is None else self.query_ticks,
             task_vector=declared.task_vector if self.task_vector is None else _names(self.task_vector),
+            tracker_vector=declared.tracker_vector if self.tracker_vector is None else _names(self.tracker_vector),
             width=declared.width if self.image_width is None else self.image_width,
             height=declared.height if self.image_height is None else self.image_height,
             fit=declared.fit if self.fit is None else self.fit,
@@ -139,7 +142,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
         }
         if worlds.task_vector:
-            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(worlds.task_vector),))
+            told = len(worlds.task_vector) + (len(worlds.tracker_vector) + 1 if worlds.tracker_vector else 0)
+            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (told,))
         self.features_map = {key: key for key in self.features}
 
     @property

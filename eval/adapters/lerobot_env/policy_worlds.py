@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,8 @@ from lerobot.configs import parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
+from arena_newton.files.stored_json import read_object
 from arena_newton.pictures.settings import Fit, robot_fit
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
@@ -28,6 +29,8 @@ class PolicyWorlds:
     """Of v4: ticks between two queries of the policy, at which the heading is measured."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given; none: it is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow, as of `CheckpointFacts`."""
     width: int = 224
     """Width of its pictures [px]."""
     height: int = 224
@@ -43,8 +46,9 @@ class PolicyWorlds:
         flags = {"labels": self.labels, "image_width": self.width, "image_height": self.height, "fit": self.fit}
         if self.labels == "v4":
             flags |= {"realign": self.realign, "query_ticks": self.query_ticks}
-        if self.task_vector:
-            flags["task_vector"] = ",".join(self.task_vector)
+        for name in ("task_vector", "tracker_vector"):
+            if getattr(self, name):
+                flags[name] = ",".join(getattr(self, name))
         return " ".join(f"--env.{name}={value}" for name, value in flags.items())
 
 
@@ -65,7 +69,7 @@ def policy_worlds() -> PolicyWorlds:
     if not (Path(given) / CONFIG_FILE).is_file():
         return PolicyWorlds()
     path = Path(given) / CONFIG_FILE
-    content = _config(path)
+    content = read_object(path, MAX_CONFIG_BYTES)
     facts, ticks = CheckpointFacts.read(path.parent), _query_ticks(path, content)
     if facts is None:
         width, height = _picture(path, content)
@@ -77,21 +81,12 @@ def policy_worlds() -> PolicyWorlds:
         realign=facts.realign,
         query_ticks=ticks,
         task_vector=facts.task_vector,
+        tracker_vector=facts.tracker_vector,
         width=camera.width,
         height=camera.height,
         fit=camera.fit,
         source=path.with_name(FACTS_FILE),
     )
-
-
-def _config(path: Path) -> Mapping[str, object]:
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
-    return content
 
 
 def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:

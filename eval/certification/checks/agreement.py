@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -20,9 +21,9 @@ from arena_newton.eval.certification.finding import (
     score,
     skipped,
 )
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import mcnemar
 from arena_newton.eval.workers.batch_player import device_name
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
 
@@ -76,12 +77,8 @@ def _same_start(context: Context, other: str, device: str) -> tuple[str, Table, 
     rows, wrong, most = [], [], 0.0
     tracker = context.trackers[0]
     for task in context.tasks:
-
-        def measure(task: str = task) -> JsonObject:
-            return first_ticks(context, task, tracker, other, device)
-
+        measure = functools.partial(first_ticks, context, task, tracker, other, device)
         found = context.measured("engines", task, tracker, {"other": other, "device": device}, measure)
-        assert isinstance(found, dict)
         unlike, gaps = [str(name) for name in found["unlike"]], [float(gap) for gap in found["gaps"]]
         most = max(most, *gaps)
         rows.append((task, " ".join(unlike) or "none", *(f"{gap:.1e}" for gap in gaps)))
@@ -202,12 +199,8 @@ def batches(context: Context) -> CheckFinding:
     ticks, rows, broken = BATCHED_TICKS[not quick], [], []
     for tracker in context.trackers:
         for task in context.tasks[:BATCHED_TASKS] if quick else context.tasks:
-
-            def measure(task: str = task, tracker: str = tracker) -> JsonObject:
-                return _compare_batches(context, task, tracker, ticks)
-
+            measure = functools.partial(_compare_batches, context, task, tracker, ticks)
             found = context.measured("batches", task, tracker, {"ticks": ticks}, measure)
-            assert isinstance(found, dict)
             differs = found["differs"]
             rows.append((task, tracker, f"{int(found['ticks']):,}", "none" if differs is None else str(differs)))
             broken += [f"{task} through {tracker}: differs from tick {differs} on"] * (differs is not None)

@@ -26,7 +26,7 @@ from arena_newton.usd_scenes.g1.links import LINKS
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json
+    from arena_newton.files.stored_json import Json
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "TOLERANCE", "Bench", "Measurement", "measured_in"]

@@ -17,7 +17,7 @@ from arena_newton.pictures.settings import CameraConfig
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json
+    from arena_newton.files.stored_json import Json
 
 __all__ = ["CHECKS", "lens_of"]
 

@@ -22,10 +22,10 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
-from arena_newton.eval.records.schema import Json, JsonObject
 from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
+from arena_newton.files.stored_json import Json, JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
 
@@ -111,7 +111,6 @@ def shards(context: Context) -> CheckFinding:
             return compared(alone, Path(kept) / "merged")
 
     found = context.measured("shards", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if "refused" in found:
         return CheckFinding("fail", f"shards are not merged: {found['refused']}")
     verdict, text, wrong = _judged(found, f"{SHARDS} merged shards")
@@ -143,7 +142,6 @@ def ray(context: Context) -> CheckFinding:
         return facts | (compared(alone, folder) if run.code in (0, 1) else {})
 
     found = context.measured("ray", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if found["code"] not in (0, 1):
         how = f"took longer than {RAY_MINUTES:g} min" if found["code"] is None else f"ended with code {found['code']}"
         return CheckFinding("fail", f"a run by a Ray cluster {how}: {found['said']}")

@@ -18,7 +18,7 @@ from arena_newton.tasks.double_desk import SILL
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "Treads"]

@@ -114,8 +114,8 @@ def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.0
         "action": {"mean": stand, "std": torch.full((40,), spread)},
     }
     if facts is not None and facts.task_vector:
-        features[TASK] = PolicyFeature(FeatureType.ENV, (len(facts.task_vector),))
-        stats[TASK] = {"mean": torch.zeros(len(facts.task_vector)), "std": torch.ones(len(facts.task_vector))}
+        features[TASK] = PolicyFeature(FeatureType.ENV, (facts.vector_width,))
+        stats[TASK] = {"mean": torch.zeros(facts.vector_width), "std": torch.ones(facts.vector_width)}
     config = configuration(family, features, clip, **changes)
     policy = get_policy_class(config.type)(config)
     for parameter in policy.parameters():  # some begin at 0, which would hide what they are multiplied with
@@ -134,7 +134,7 @@ def facts(**changes):
     return CheckpointFacts(**{"width": SIDE, "height": SIDE} | changes)
 
 
-def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing"):
+def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="twist2"):
     """Observation of worlds, which follows from each world's seed and tick alone."""
     state, pictures = [], []
     for key in zip(seeds, ticks, strict=True):
@@ -148,6 +148,7 @@ def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing"):
         task=task,
         gym_id=task,
         instruction="Strike the green markers on the punching bag.",
+        tracker=tracker,
     )
 
 

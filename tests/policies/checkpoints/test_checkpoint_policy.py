@@ -185,6 +185,19 @@ def test_the_task_vector_names_the_task(tmp_path):
         policy.check_task("football")
 
 
+def test_the_task_vector_names_the_tracker(tmp_path):
+    """Each tracker has its own answer to the same picture; those that the vector does not name have one of theirs."""
+    vectors = {"task_vector": ("boxing",), "tracker_vector": ("sonic", "twist2")}
+    policy = LeRobotPolicy(save(tmp_path / "both", "act", facts=facts(**vectors)))
+    answers = {}
+    for tracker in ("sonic", "twist2", "falcon", ""):
+        policy.reset([11], ["boxing"])
+        answers[tracker] = policy.act(seen([11], [0], tracker=tracker)).actions
+    assert torch.equal(answers["falcon"], answers[""])
+    assert len({tuple(one.flatten().tolist()) for one in answers.values()}) == 3
+    assert policy.describe()["tracker_vector"] == ["sonic", "twist2"]
+
+
 def test_half_precision_computes_in_float32(tmp_path, checkpoints):
     """Weights that are stored in float16 give nearly the same actions, in float32."""
     from safetensors.torch import load_file, save_file

@@ -33,6 +33,7 @@ OURS = {
     "labels": "v4",
     "realign": 0.002,
     "task_vector": TASKS,
+    "tracker_vector": ("sonic", "twist2"),
     "tasks": TASKS,
     "trackers": ("twist2",),
 }
@@ -99,11 +100,11 @@ def test_lerobot_is_not_imported(packed):
 
 
 def test_a_task_vector_decides(packed):
-    """The task is an input: another one changes the answer."""
+    """Task and tracker are inputs: another one changes the answer."""
     policy = LearnedPolicy(packed)
     policy.card = dataclasses.replace(policy.card, tasks=TASKS)
-    answers = [policy.act(seen([5], [0], task=task)).actions for task in TASKS]
-    assert not torch.equal(*answers)
+    looks = [seen([5], [0], task=task, tracker=tracker) for task in TASKS for tracker in ("sonic", "twist2", "")]
+    assert len({tuple(policy.act(look).actions.flatten().tolist()) for look in looks}) == 6
 
 
 def test_one_task_needs_no_vector(tmp_path):

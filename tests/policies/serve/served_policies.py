@@ -43,6 +43,7 @@ class Remembers(Policy):
         self.most_inside = max(self.inside, self.most_inside)
         rows = np.flatnonzero(observation.mask)
         self.calls.append((len(rows), observation.task, observation.instruction))
+        self.tracker = observation.tracker
         time.sleep(self.pause)
         self.queries[rows] += 1
         self.sums[rows] += observation.state[rows, 6].numpy()

@@ -41,13 +41,13 @@ def episode(server, owner, seed, values, step=4):
 
 def test_queries_that_come_together_are_one_call(made):
     """Queries within max_wait are answered by one call of the policy, no more than max_batch_size at once."""
-    server = made(Remembers(), max_batch_size=4, max_wait=0.5)
+    server = made(Remembers(), max_batch_size=4, max_wait=0.5, tracker="sonic")
     for n in range(6):
         server.begin(str(n), Begin("", n, "boxing"))
     answers = together(*[lambda n=n: server.query(str(n), query(n, seed=n, step=0)) for n in range(6)])
     assert all(answer.actions.shape == (4, 40) for answer in answers)
     assert sorted(size for size, *_ in server.policy.calls) == [2, 4]
-    assert server.counts.batches == {4: 1, 2: 1} and server.counts.queries == 6
+    assert server.counts.batches == {4: 1, 2: 1} and server.counts.queries == 6 and server.policy.tracker == "sonic"
 
 
 def test_nobody_waits_for_sessions_that_ask_already(made):
