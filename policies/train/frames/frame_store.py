@@ -19,15 +19,12 @@ from arena_newton.data.readers.frame_reader import Frames
 from arena_newton.errors import InputError
 from arena_newton.policies.train.frames.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
 from arena_newton.policies.train.frames.demonstration_rows import (
-    ACTION_KEY,
-    STATE_KEY,
-    VECTOR_KEY,
     DatasetRows,
     EpisodeRows,
 )
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
-__all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
+__all__ = ["FrameStore", "assembled", "check_memory", "free_memory", "load_frames", "needed_memory"]
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
@@ -265,52 +262,3 @@ def assembled(
         top=top,
         bottom=bottom,
     )
-
-
-def made_frames(
-    frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500, network: int = 0
-) -> FrameStore:
-    """Rows of noise, for measurements without a dataset.
-
-    Args:
-        frames: Number of rows.
-        size: Height and width of a picture [px]; an eighth of the rows above and below is black, as in a padded one.
-        device: Where they are wanted.
-        seed: Of the noise.
-        length: Rows of an episode.
-        network: Memory that the network needs beside them [bytes].
-
-    Raises:
-        InputError: They do not fit.
-    """
-    band = size // 8
-    check_memory(frames, size - 2 * band, size, device, network)
-    generator = torch.Generator(device).manual_seed(seed)
-    pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
-    for start in range(0, frames, length):
-        part = pictures[start : start + length]
-        part.copy_(torch.randint(0, 256, part.shape, generator=generator, dtype=torch.uint8, device=device))
-    rng = np.random.default_rng(seed)
-    episodes = []
-    for start in range(0, frames, length):
-        rows = min(length, frames - start)
-        states = rng.normal(size=(rows, STATE_WIDTH)).astype(np.float32)
-        actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
-        episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
-    return assembled(episodes, pictures, [False] * len(episodes), band, band)
-
-
-def made_statistics() -> dict[str, dict[str, torch.Tensor]]:
-    """Statistics of rows of noise, of one task."""
-    found = {}
-    for key, width in ((STATE_KEY, STATE_WIDTH), (ACTION_KEY, ACTION_WIDTH), (VECTOR_KEY, 1)):
-        ones = torch.ones(width)
-        found[key] = {
-            "mean": 0 * ones,
-            "std": ones,
-            "min": -4 * ones,
-            "max": 4 * ones,
-            "q01": -2 * ones,
-            "q99": 2 * ones,
-        }
-    return found
