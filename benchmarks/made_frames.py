@@ -1,15 +1,15 @@
-"""Rows of noise and their statistics, for measurements of trainings without a dataset."""
+"""Rows of noise, for measurements of trainings without a dataset."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from arena_newton.policies.train.frames.demonstration_rows import ACTION_KEY, STATE_KEY, VECTOR_KEY, EpisodeRows
+from arena_newton.policies.train.frames.demonstration_rows import EpisodeRows
 from arena_newton.policies.train.frames.frame_store import FrameStore, assembled, check_memory
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
-__all__ = ["made_frames", "made_statistics"]
+__all__ = ["made_frames"]
 
 
 def made_frames(
@@ -29,7 +29,7 @@ def made_frames(
         InputError: They do not fit.
     """
     band = size // 8
-    check_memory(frames, size - 2 * band, size, device, network)
+    check_memory(frames, frames, size - 2 * band, size, device, network)
     generator = torch.Generator(device).manual_seed(seed)
     pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
     for start in range(0, frames, length):
@@ -43,19 +43,3 @@ def made_frames(
         actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
         episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
     return assembled(episodes, pictures, [False] * len(episodes), band, band)
-
-
-def made_statistics() -> dict[str, dict[str, torch.Tensor]]:
-    """Statistics of rows of noise, of one task."""
-    found = {}
-    for key, width in ((STATE_KEY, STATE_WIDTH), (ACTION_KEY, ACTION_WIDTH), (VECTOR_KEY, 1)):
-        ones = torch.ones(width)
-        found[key] = {
-            "mean": 0 * ones,
-            "std": ones,
-            "min": -4 * ones,
-            "max": 4 * ones,
-            "q01": -2 * ones,
-            "q99": 2 * ones,
-        }
-    return found

@@ -129,15 +129,15 @@ class _Found:
         """In words."""
         from arena_newton.eval.studies.placement_files import rate_text
 
-        told = [f"mean over the range: {rate_text(*self.mean)}"]
+        parts = [f"mean over the range: {rate_text(*self.mean)}"]
         if self.worst is None or self.confirmed is None:
-            return [*told, "worst: none judged"]
-        told.append(f"worst of {counted(self.episodes, 'episode')}: {self.worst.where(self.axes)}")
+            return [*parts, "worst: none judged"]
+        parts.append(f"worst of {counted(self.episodes, 'episode')}: {self.worst.where(self.axes)}")
         ended = (
             f"slowest of its successes {self.worst.success_s:.1f} s"
             if self.worst.rate == 1.0
             else (f"{self.worst.successes}/{self.worst.judged}, mean margin {self.worst.mean_margin:+.3f} m")
         )
-        told.append(f"  as found: {ended}")
-        told.append(f"  with new seeds: {rate_text(self.confirmed.successes, self.confirmed.judged)}")
-        return told
+        parts.append(f"  as found: {ended}")
+        parts.append(f"  with new seeds: {rate_text(self.confirmed.successes, self.confirmed.judged)}")
+        return parts

@@ -117,12 +117,12 @@ def summary(axes: Sequence[Axis], points: Sequence[PointTally]) -> list[str]:
     lines = [f"success over {counted(len(points), 'placement')}: {rate_text(successes, judged)}"]
     if errors:
         lines.append(f"{counted(errors, 'episode')} ended with an error and are in no rate")
-    told = [one for one in points if one.judged]
+    rated = [one for one in points if one.judged]
     if successes < judged:
-        worst = min(told, key=lambda one: (one.rate, one.mean_margin))
+        worst = min(rated, key=lambda one: (one.rate, one.mean_margin))
         counts = f"{worst.successes}/{worst.judged}, mean margin {worst.mean_margin:+.3f} m"
         lines.append(f"worst at {worst.where(axes)}: {counts}")
-    elif told:
-        slowest = max(told, key=lambda one: one.success_s)
+    elif rated:
+        slowest = max(rated, key=lambda one: one.success_s)
         lines.append(f"slowest at {slowest.where(axes)}: {slowest.success_s:.1f} s")
     return lines

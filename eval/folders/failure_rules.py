@@ -96,8 +96,8 @@ def stage_of(episode: EpisodeRecord, bars: Bars = BARS) -> FailureStage | None:
 
 def _touched(episode: EpisodeRecord, signals: EpisodeSignals, task: Interaction) -> int | None:
     """Tick of the first touch; None where there was none, or the task's own predicate says that there was none."""
-    said = episode.predicates.get(task.predicate, signals.first_touch)
-    return None if said is None or signals.first_touch is None else max(said, signals.first_touch)
+    declared = episode.predicates.get(task.predicate, signals.first_touch)
+    return None if declared is None or signals.first_touch is None else max(declared, signals.first_touch)
 
 
 def _without_effect(episode: EpisodeRecord, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:

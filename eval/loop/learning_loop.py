@@ -65,7 +65,7 @@ def run(options: LoopOptions, factories: Factories | None = None) -> int:
         was recorded, 130 interrupted.
 
     Raises:
-        InputError: A flag or the folder is wrong, or something is missing that a later stage needs; said before
+        InputError: A flag or the folder is wrong, or something is missing that a later stage needs, before
             anything is played.
     """
     options = resolved(options)

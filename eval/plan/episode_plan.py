@@ -151,5 +151,5 @@ def listed(episode: Episode) -> JsonObject:
         light = dataclasses.asdict(draws.light)
         light |= {"direction": list(draws.light.direction), "color": list(draws.light.color)}
     keys = ("task", "mode", "rules", "group_seed", "repeat", "episode_seed", "object_seed")
-    said = {key: getattr(episode, key) for key in keys}
-    return said | {"sampled": draws.sampled, "placed": placed, "light": light, "max_steps": episode.max_steps}
+    facts = {key: getattr(episode, key) for key in keys}
+    return facts | {"sampled": draws.sampled, "placed": placed, "light": light, "max_steps": episode.max_steps}

@@ -233,8 +233,8 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         before = ended.get(record.index)
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
             raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
-        if (said := contradiction(record)) is not None:
-            raise ContradictionError(f"{name}: {said}; {by_hand}, or wrong when it was written")
+        if (text := contradiction(record)) is not None:
+            raise ContradictionError(f"{name}: {text}; {by_hand}, or wrong when it was written")
         ended[record.index] = record
 
 

@@ -7,13 +7,13 @@ number in range.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.files.stored_json import Fit, JsonObject, Known, parse, read_regular, shown
+from arena_newton.files.stored_json import Fit, Json, JsonObject, Known, parse, read_regular, shown
 from arena_newton.rules.rule_types import MODES
 
 __all__ = ["MAX_CONFIG_BYTES", "MAX_COUNT", "MAX_EPISODES", "MAX_JOURNAL_BYTES", "MAX_SEED", "Count", "Mode"]
@@ -35,7 +35,7 @@ Positive = Annotated[int, Fit("a number of at least 1", lambda value: 1 <= value
 Seed = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_SEED)]
 
 
-def check_schema(where: str, content: JsonObject, newest: int) -> None:
+def check_schema(where: str, content: Mapping[str, Json], newest: int) -> None:
     """Refuse a form that this version does not know.
 
     Raises:

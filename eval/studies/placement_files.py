@@ -65,8 +65,8 @@ class PointTally:
 
     def where(self, axes: Sequence[Axis]) -> str:
         """The placement in words."""
-        told = zip(axes, self.values, strict=True)
-        return ", ".join(f"{axis.name} {value:.3g} {axis.unit}".rstrip() for axis, value in told)
+        columns = zip(axes, self.values, strict=True)
+        return ", ".join(f"{axis.name} {value:.3g} {axis.unit}".rstrip() for axis, value in columns)
 
 
 def tallies(results: Sequence[EpisodeResult]) -> list[PointTally]:
@@ -158,8 +158,8 @@ class _PlacedRows:
 
     def _row(self, result: EpisodeResult) -> list[object]:
         placed: PlacedEpisode = result.episode
-        told = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
-        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *told]
+        columns = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
+        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *columns]
 
 
 class PlacedStudy:
@@ -217,10 +217,10 @@ def _number(value: float) -> str:
 
 def point_rows(axes: Sequence[Axis], points: Sequence[PointTally]) -> str:
     """CSV with one row per placement."""
-    told = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
+    columns = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
     whole = io.StringIO()
     writer = csv.writer(whole, lineterminator="\n")
-    writer.writerow([*(axis.name for axis in axes), *told])
+    writer.writerow([*(axis.name for axis in axes), *columns])
     for one in points:
         counts = (one.episodes, one.successes, one.falls, one.errors)
         measured = (one.rate, one.mean_margin, one.least_margin, one.success_s)

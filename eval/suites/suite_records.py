@@ -88,7 +88,7 @@ class SuiteCell:
     latency: Count = 0
     """Ticks by which each chunk starts late."""
     replan: Annotated[Positive | None, Fit("a number of actions or null")] = None
-    """Actions of a chunk that are executed before the next look; None: all."""
+    """Actions of a chunk that are executed before the next query; None: all."""
     ensemble: bool = False
     """True if all chunks that cover a tick are averaged."""
     folder: Folder

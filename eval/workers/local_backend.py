@@ -18,7 +18,7 @@ from typing import cast
 
 from arena_newton.eval.workers.actor import EpisodeActor
 from arena_newton.eval.workers.backend import Process, WorkerLost
-from arena_newton.eval.workers.slice_events import Done, Event, Node, Opened
+from arena_newton.eval.workers.messages import Done, Event, Node, Opened
 from arena_newton.files.own_processes import environment, start_module
 from arena_newton.files.text import counted
 from arena_newton.physics.devices import visible_gpus

@@ -1,7 +1,7 @@
 """A checkpoint of ACT as files, read without LeRobot: sizes, statistics and weights, all checked.
 
 What is read is what LeRobot writes (`config.json`, the processors' files, `model.safetensors`), JSON and safetensors
-only. Whatever a look would be computed differently by is refused, so that a packed policy answers as LeRobot does.
+only. Whatever a query would be computed differently by is refused, so that a packed policy answers as LeRobot does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ STEPS = {
     ),
     "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
 }
-"""Steps of ACT's processors in LeRobot 0.6; others would change a look."""
+"""Steps of ACT's processors in LeRobot 0.6; others would change a query."""
 FRONT, STATE, TASK_VECTOR = "observation.images.front", "observation.state", "observation.environment_state"
 """Keys of the observations."""
 KINDS = {FRONT: "VISUAL", STATE: "STATE", TASK_VECTOR: "ENV", "action": "ACTION"}
@@ -85,7 +85,7 @@ class ActCheckpoint:
     folder: Path
     sizes: ActSizes
     executed: int
-    """Actions of an answer that are executed before the next look."""
+    """Actions of an answer that are executed before the next query."""
     facts: CheckpointFacts
     spreads: Mapping[str, Spread]
     """Feature → how it is normalised; a feature that is not here goes in, or comes out, as it is."""
@@ -128,8 +128,8 @@ def loaded_network(path: Path, sizes: ActSizes, weights: dict[str, torch.Tensor]
         network = ActNetwork(sizes)
         network.load(weights)
     except (KeyError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: does not hold the weights of this network: {text}") from None
     return network
 
 
@@ -144,8 +144,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         with safe_open(path, framework="pt") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: not readable as safetensors ({said})") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: not readable as safetensors ({text})") from None
     for name, value in found.items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")
@@ -162,7 +162,7 @@ def read_act_checkpoint(folder: Path) -> ActCheckpoint:
     config = read_object(folder / CONFIG_FILE, MOST_JSON)
     kind = config.get("type")
     if kind != "act":
-        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}; only act is packed, whose looks are cheap")
+        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}; only act is packed, whose queries are cheap")
     facts = CheckpointFacts.read(folder)
     if facts is None:
         raise InputError(f"{folder}: holds no {FACTS_FILE}, which says how its actions are read")
@@ -191,7 +191,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     """Sizes of the network; whatever it would need besides is refused."""
     expected: dict[str, list[int]] = {FRONT: [3, facts.height, facts.width], STATE: [STATE_WIDTH]}
     if facts.task_vector:
-        expected[TASK_VECTOR] = [len(facts.task_vector)]
+        expected[TASK_VECTOR] = [facts.vector_width]
     for field, wanted in (("input_features", expected), ("output_features", {"action": [ACTION_WIDTH]})):
         given = _object(path, field, config.get(field))
         shapes = {name: _object(path, f"{field}.{name}", one).get("shape") for name, one in given.items()}
@@ -217,7 +217,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     if numbers["dim_model"] % numbers["n_heads"] or numbers["dim_model"] % 4:
         raise InputError(f"{path}: dim_model is {numbers['dim_model']}, expected a multiple of n_heads and of 4")
     words = {one.name: config[one.name] for one in fields(ActSizes) if one.name in refused}
-    return ActSizes(state=STATE_WIDTH, tasks=len(facts.task_vector), actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
+    return ActSizes(state=STATE_WIDTH, tasks=facts.vector_width, actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
 
 
 def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str]]:

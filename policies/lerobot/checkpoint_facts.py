@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,7 +20,7 @@ from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.files.text import plain_text
 from arena_newton.pictures.settings import CameraConfig
 
-__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
+__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder", "vector_of"]
 
 FACTS_FILE = "arena_policy.json"
 """File of a checkpoint that holds its `CheckpointFacts`."""
@@ -55,6 +55,9 @@ class CheckpointFacts:
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given as `observation.environment_state`; none: it
     is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow those of the tasks, and one more for any other tracker; none:
+    the vector says nothing of the tracker."""
     family: str = ""
     """`act`, `diffusion`, `flow`, `pi05`."""
     recipe: str = ""
@@ -74,6 +77,15 @@ class CheckpointFacts:
     """Of each dataset: `name`, `hash` of its content, `episodes`, `frames`."""
     options: Mapping[str, object] = field(default_factory=dict)
     """The training's resolved options."""
+
+    @property
+    def vector_width(self) -> int:
+        """Numbers of the vector of task and tracker; 0: the policy is given none."""
+        return len(self.vector("", ""))
+
+    def vector(self, task: str, tracker: str) -> list[float]:
+        """The vector of a task and a tracker."""
+        return vector_of(self.task_vector, self.tracker_vector, task, tracker)
 
     @property
     def camera(self) -> CameraConfig:
@@ -97,9 +109,11 @@ class CheckpointFacts:
         if not path.is_file():
             return None
         facts = loaded(str(path), read_object(path, MOST_BYTES, FORMAT), cls)
-        if len(set(facts.task_vector)) < len(facts.task_vector):
-            raise InputError(f"{path}: task_vector names a task twice")
-        for key in ("task_vector", "tasks", "trackers"):
+        if facts.tracker_vector and not facts.task_vector:
+            raise InputError(f"{path}: tracker_vector is given without a task_vector, which it is a part of")
+        for key in ("task_vector", "tracker_vector", "tasks", "trackers"):
+            if key.endswith("vector") and len(set(getattr(facts, key))) < len(getattr(facts, key)):
+                raise InputError(f"{path}: {key} names a {key.removesuffix('_vector')} twice")
             for name in getattr(facts, key):
                 if not _NAME.fullmatch(name):
                     raise InputError(f"{path}: {key} holds {plain_text(name, 60)!r}, which is no name")
@@ -110,6 +124,21 @@ class CheckpointFacts:
         except InputError:
             raise InputError(f"{path}: labels is {facts.labels!r}, a protocol that is not known") from None
         return facts
+
+
+def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker: str) -> list[float]:
+    """One-hot numbers of a task, then, where trackers are named, of a tracker.
+
+    Args:
+        tasks: In the order of their numbers.
+        trackers: In the order of their numbers, after which one more is that of any other tracker.
+        task: Name.
+        tracker: Name; empty: not known.
+    """
+    told = [float(name == task) for name in tasks]
+    if trackers:
+        told += [float(name == tracker) for name in trackers] + [float(tracker not in trackers)]
+    return told
 
 
 def checkpoint_folder(path: Path, flag: str = "--policy lerobot") -> Path:

@@ -123,7 +123,7 @@ class PolicyCheckpoint:
 
     @property
     def executed(self) -> int:
-        """Actions of an answer that are executed before the next look."""
+        """Actions of an answer that are executed before the next query."""
         return int(self.config.n_action_steps)
 
 
@@ -208,9 +208,9 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
 
 def _reason(error: BaseException) -> str:
     """Message of an error and of its cause, which draccus leaves out."""
-    said = " ".join(str(error).split())[:300]
+    text = " ".join(str(error).split())[:300]
     behind = " ".join(str(error.__cause__ or error.__context__ or "").split())[:200]
-    return said if not behind or behind in said else f"{said} ({behind})"
+    return text if not behind or behind in text else f"{text} ({behind})"
 
 
 def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
@@ -256,11 +256,11 @@ def _check_normaliser(where: str, options: Mapping[str, object], state: object, 
     eps = options.get("eps", 0.0)
     if isinstance(eps, bool) or not isinstance(eps, int | float) or not 0.0 <= eps < math.inf:
         raise InputError(f"{where}.config.eps is {eps!r:.40}, expected a number of at least 0")
-    said = {kind: mode.value for kind, mode in config.normalization_mapping.items()}
-    if options.get("norm_map") != said:
+    facts = {kind: mode.value for kind, mode in config.normalization_mapping.items()}
+    if options.get("norm_map") != facts:
         given = f"{options.get('norm_map')!r:.120}"
-        raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {said}")
-    if state is None and set(said.values()) != {"IDENTITY"}:
+        raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {facts}")
+    if state is None and set(facts.values()) != {"IDENTITY"}:
         raise InputError(f"{where} names no state_file, the statistics by which it is to normalise")
 
 
@@ -289,12 +289,13 @@ def _features(
         if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
             picture = (int(shape[1]), int(shape[2]))
             continue
-        if given == TASK_VECTOR and facts.task_vector and shape == (len(facts.task_vector),):
+        if given == TASK_VECTOR and facts.task_vector and shape == (facts.vector_width,):
             continue
         if name.startswith("observation.images.empty_camera_") and config.type == "pi05":
             continue  # the network fills it with an empty picture itself
         if given == TASK_VECTOR:
-            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks for it"
+            trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
+            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
             raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
         known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
@@ -302,8 +303,8 @@ def _features(
         if renamed.get(name, name) not in inputs:
             raise InputError(f"{path}: has no input {renamed.get(name, name)}, which every policy here is given")
     if own and picture is not None and picture != (facts.height, facts.width):
-        said = f"{FACTS_FILE} says {facts.width}x{facts.height}"
-        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {said}")
+        text = f"{FACTS_FILE} says {facts.width}x{facts.height}"
+        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {text}")
     return picture
 
 

@@ -110,7 +110,7 @@ class ServedFacts:
 
     def undeclared(self) -> list[str]:
         """Names of what the server does not declare, as a message lists them."""
-        said = {
+        facts = {
             "label protocol": self.labels,
             "action names": self.action_names,
             "state names": self.state_names,
@@ -118,7 +118,7 @@ class ServedFacts:
             "rate": self.rate_hz,
             "picture": self.needs_picture if self.needs_picture is not True else self.picture,
         }
-        return [name for name, value in said.items() if value is None]
+        return [name for name, value in facts.items() if value is None]
 
 
 def expected_facts(labels: str = "v3.1") -> ServedFacts:

@@ -217,7 +217,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         return arena_codec.pack_begin(self._begin(world, task))
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        return arena_codec.pack_look(self._look(seen, state, image, world))
+        return arena_codec.pack_query(self._query(seen, state, image, world))
 
     def _rows(self, content: object) -> np.ndarray:
         return self.checked(arena_codec.chunk_of(_object(content), f"{self.url}/infer"))
@@ -233,8 +233,8 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
             raise RemoteError(f"{where}: the reply is not JSON") from error
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
-            said = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            raise RemoteError(f"{where}: status {status}{said}", silent=silent, lost=episode_lost(said))
+            text = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
+            raise RemoteError(f"{where}: status {status}{text}", silent=silent, lost=episode_lost(text))
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

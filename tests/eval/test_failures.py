@@ -285,7 +285,7 @@ def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
     answers = "number,reader 1,reader 2\n1,perception,perception\n2,approach,posture\n3,contact,tracker\n"
     (tmp_path / "readers.csv").write_text(answers)
     judged = labelled_failures(tmp_path)
-    assert judged[2].said == ("recovery", "contact", "tracking (legs)")
+    assert judged[2].stages == ("recovery", "contact", "tracking (legs)")
     rates = {(one.judges, one.part): (one.same, one.failures) for one in agreements(judged)}
     assert rates[("rules", "reader 1"), "all"] == (2, 3) and rates[("rules", "reader 1"), "even"] == (1, 1)
     assert rates[("rules", "reader 2"), "odd"] == (1, 2) and rates[("reader 1", "reader 2"), "all"] == (1, 3)

@@ -84,7 +84,7 @@ def test_environments_are_stored_in_the_plans_order(tmp_path):
     options = RunOptions(task=("football", "boxing"), mode=("base", "visual"), seeds=(0,), repeats=1, engine="mujoco")
     folder = ResultsFolder(tmp_path, resolve(options), doctor.versions())
     folder.make()
-    folder.settle(folder.config, ())
+    folder.prepare(folder.config, ())
     names = [f"{task} twist2 {mode}" for task in ("football", "boxing") for mode in ("base", "visual")]
     for name in (names[2], names[3], names[0], names[2], names[1]):
         assert folder.register(name, {"engine": name}) == {"engine": name}

@@ -18,6 +18,7 @@ import pyarrow.compute
 import pyarrow.parquet
 from tqdm import tqdm
 
+from arena_newton.data.datasets.look_films import write_looks
 from arena_newton.data.datasets.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import (
     DATA_PATH,
@@ -27,6 +28,7 @@ from arena_newton.data.readers.dataset_files import (
     VideoPart,
     read_json,
 )
+from arena_newton.data.readers.looks import Looks, dataset_looks
 from arena_newton.data.recording.layouts import REFERENCE_SOURCES
 from arena_newton.errors import InputError
 from arena_newton.files.limits import MIB
@@ -175,9 +177,9 @@ class _Pictures:
             raise InputError(f"{where}: cannot be copied ({type(error).__name__}: {error})") from error
         chunk, number = divmod(self.number, self.chunk_files)
         first, self.frames, self.size = self.frames, self.frames + part.frames, self.size + size
-        told: dict[str, object] = {"chunk_index": chunk, "file_index": number}
-        told |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
-        return {f"videos/{self.key}/{name}": value for name, value in told.items()}
+        facts: dict[str, object] = {"chunk_index": chunk, "file_index": number}
+        facts |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
+        return {f"videos/{self.key}/{name}": value for name, value in facts.items()}
 
     def _packets(
         self, source: av.container.InputContainer, stream: av.VideoStream, part: VideoPart, where: str
@@ -267,6 +269,12 @@ def write_selection(selections: Sequence[Selection], root: Path) -> None:
             pictures.close()
         av.logging.set_libav_level(av.logging.INFO)
     _write_meta(selections, root, info, rows, list(tasks), data.rows)
+    films: list[tuple[Looks, Path] | None] = []
+    for selection in selections:
+        known = dataset_looks(selection.files.root, selection.files.episodes)
+        chosen = (known[number] for number in selection.episodes)
+        films += [None if film is None else (film.looks, film.path) for film in chosen]
+    write_looks(root, films)
 
 
 def _size(info: Mapping[str, object], name: str, default: int) -> int:
@@ -414,8 +422,8 @@ def _protocol(selections: Sequence[Selection]) -> dict[str, object] | None:
         same["backend_source"] = "+".join(dict.fromkeys(backends))
     for key in (f"{name}_reference_source" for name in REFERENCE_SOURCES):
         if any(key in block for block in known):  # a set of another tracker names none
-            said = [part for block in known for part in str(block.get(key) or "").split("+") if part]
-            same[key] = "+".join(dict.fromkeys(said)) or None
+            sources = [part for block in known for part in str(block.get(key) or "").split("+") if part]
+            same[key] = "+".join(dict.fromkeys(sources)) or None
     return same
 
 

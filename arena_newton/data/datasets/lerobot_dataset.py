@@ -29,12 +29,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from arena_newton import __version__
+from arena_newton.data.datasets.look_films import write_looks
 from arena_newton.data.datasets.row_statistics import row_statistics
 from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.recording.image_statistics import statistics
 from arena_newton.data.recording.layouts import Layout, described_protocol, described_slots, layout, modality
-from arena_newton.data.recording.source_videos import SourceVideo, source_video
+from arena_newton.data.recording.source_videos import SourceVideo, source_looks, source_video
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import new_folder
 from arena_newton.files.own_files import write_json
@@ -43,6 +44,7 @@ from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
     from arena_newton.data.datasets.data_options import BuildOptions
+    from arena_newton.data.readers.looks import Looks
 
 __all__ = ["LEROBOT", "SCHEMA", "Chosen", "FinishedVideos", "build", "choose", "write_dataset"]
 
@@ -77,6 +79,8 @@ class Chosen:
     fps: int
     left_out: int
     """Episodes that did not succeed."""
+    looks: tuple[tuple[Looks, Path] | None, ...] = ()
+    """Looks of each episode's head camera and their film."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -206,7 +210,8 @@ def choose(
         if name in seen:
             raise InputError(f"{episode.path}: is the same episode as {seen[name].path} ({' '.join(map(str, name))})")
         seen[name] = episode
-    return Chosen(tuple(episodes), tuple(videos), rate, len(every) - len(episodes))
+    looks = tuple(map(source_looks, episodes)) if "front" in wanted else ()
+    return Chosen(tuple(episodes), tuple(videos), rate, len(every) - len(episodes), looks)
 
 
 def _rate(episode: EpisodeFile) -> int:
@@ -401,6 +406,7 @@ def _finish(chosen: Chosen, root: Path, *, kind: Layout, labels: str) -> None:
     info["arena"] = _origin(chosen, kind, labels)
     write_json(meta / "info.json", info)
     write_json(meta / "modality.json", modality(kind, labels, chosen.cameras))
+    write_looks(root, chosen.looks)
     rights = (meta / "info.json").stat().st_mode & 0o777
     for file in root.rglob("*"):
         if file.is_file():

@@ -22,7 +22,7 @@ from arena_newton.eval.certification.finding import (
     skipped,
 )
 from arena_newton.eval.statistics.stats import mcnemar
-from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.eval.workers.batch_player import device_name
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
@@ -170,13 +170,13 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Tab
         "falls",
         "p of falls",
     )
-    said = [
+    gaps = [
         f"{what} by {percent(low)} % to {percent(high)} %"
         for what, (low, high) in zip(("success", "falls"), bounds.values(), strict=True)
     ]
     notes = [
         f"Engines are equivalent where the 95 % interval of the difference of their rates, all {pairs} pairs of the "
-        f"same episodes together, is within {percent(MARGIN, 0)} % on either side: {'; '.join(said)}. It has the upper "
+        f"same episodes together, is within {percent(MARGIN, 0)} % on either side: {'; '.join(gaps)}. It has the upper "
         "97.5 % bounds (Clopper and Pearson) of the pairs that only one engine wins, less 0 of the other's: wider than "
         "the interval of `eval compare`, and sure to cover in 95 %. "
         f"They differ in a cell where p, that of McNemar's exact test, is below {level:.2g}: {DIFFERENT} over "
@@ -187,7 +187,7 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Tab
     verdict: Verdict = "fail" if apart or far else "pass" if within else "note"
     if verdict == "note":
         notes.append(f"{pairs} pairs are too few to show that the rates are within {percent(MARGIN, 0)} %.")
-    summary = f"{this} and {other} on {where}: rates differ in {', '.join(said)} (95 %)"
+    summary = f"{this} and {other} on {where}: rates differ in {', '.join(gaps)} (95 %)"
     return verdict, summary, Table(head, rows, title="Rates of both engines"), tuple(notes)
 
 

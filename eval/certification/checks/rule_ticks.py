@@ -185,11 +185,11 @@ def rules(context: Context) -> CheckFinding:
 
         found = context.measured("rules", task, tracker, {"seeds": list(seeds)}, measure)["found"]
         for held, judged in found:
-            told = [("none" if tick is None else str(tick)) for tick in (held, judged)]
-            rows.append((task, str(RULES[task][1]), *told))
+            shown = [("none" if tick is None else str(tick)) for tick in (held, judged)]
+            rows.append((task, str(RULES[task][1]), *shown))
             compared += held is not None
             if held != judged:
-                wrong.append(f"{task}: succeeds at tick {told[1]}, its rule holds from tick {told[0]} on")
+                wrong.append(f"{task}: succeeds at tick {shown[1]}, its rule holds from tick {shown[0]} on")
     if not compared:
         wrong.append("no episode succeeded")
     head = ("task", "ticks in a row", "the rule holds at tick", "the episode succeeds at tick")

@@ -64,7 +64,9 @@ class EpisodeFilm:
     """Number of the first one in the film."""
     frames: int
     row: int
-    """Row of the first one."""
+    """Number of the first one among all that are wanted."""
+    every: int = 1
+    """Pictures of the film from one that is wanted to the next."""
 
     def __str__(self) -> str:
         return f"{self.root}: episode {self.episode}"
@@ -211,7 +213,7 @@ class DecoderPool:
             for start in range(0, film.frames, most):
                 pictures = own.pictures[: min(most, film.frames - start)]
                 try:
-                    decoder.fill(film.path, film.first + start, pictures)
+                    decoder.fill(film.path, film.first + start * film.every, pictures, film.every)
                 except InputError as error:
                     raise InputError(f"{film}: {error}") from error
                 put(film.row + start, pictures)
@@ -237,7 +239,7 @@ class DecoderPool:
             worker.film = waiting.popleft() if waiting else -1
             if worker.film >= 0:
                 film = films[worker.film]
-                about = {"path": str(film.path), "first": film.first, "frames": film.frames}
+                about = {"path": str(film.path), "first": film.first, "frames": film.frames, "every": film.every}
                 _tell(worker, about | {"top": top, "bottom": bottom})
 
         left = len(films)

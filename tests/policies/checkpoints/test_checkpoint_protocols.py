@@ -35,7 +35,7 @@ def fast(tmp_path_factory):
 
 @pytest.mark.parametrize("realign", [0.0, 0.05])
 def test_a_v4_checkpoint_through_lerobot_eval(fast, realign, tmp_path, monkeypatch):
-    """Actions are decoded per world, with the heading measured at the policy's looks: every tick is the same."""
+    """Actions are decoded per world, with the heading measured at the policy's queries: every tick is the same."""
     monkeypatch.setattr(gym, "ArenaEnv", WatchedEnv)
     policy = LeRobotPolicy(fast)
     policy.realign = realign
@@ -51,7 +51,7 @@ def test_a_v4_checkpoint_through_lerobot_eval(fast, realign, tmp_path, monkeypat
     flags = ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
     flags += ["--env.task=boxing", "--env.engine=mujoco", "--env.device=cpu", f"--env.image_width={SIDE}"]
     flags += [f"--env.image_height={SIDE}", f"--env.episode_length={TICKS}", "--env.labels=v4"]
-    flags += [f"--env.realign={realign}", f"--env.look_ticks={policy.chunk_size}", f"--policy.path={fast}"]
+    flags += [f"--env.realign={realign}", f"--env.query_ticks={policy.chunk_size}", f"--policy.path={fast}"]
     # One row per forward pass, as on our CPU: with more, libraries sum in another order.
     flags += ["--policy.device=cpu", "--eval.n_episodes=2", "--eval.batch_size=1", "--seed=0"]
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags, f"--output_dir={tmp_path}"])
