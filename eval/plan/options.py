@@ -265,8 +265,6 @@ class RunOptions(
     Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
-    seeing: Annotated[bool, tyro.conf.Suppress] = False
-    """Also play a few episodes of the policy that comes with the package (the default run)."""
     series: Annotated[int | None, tyro.conf.Suppress] = None
     """Series of demonstrations whose seeds are played instead of the evaluation's (`eval record`)."""
     keep: Annotated[int | None, tyro.conf.Suppress] = None
