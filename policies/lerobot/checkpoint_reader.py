@@ -7,7 +7,6 @@ are steps of LeRobot by their registered names, of those that a policy of our fa
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import math
 from collections.abc import Iterator, Mapping
