@@ -34,18 +34,12 @@ from arena_newton.policies.train import (
 from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.batching import BatchMaker
-<<<<<<< HEAD
-from arena_newton.policies.train.policy_options import PolicyTrainOptions
-from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.training import chosen_recipe, train
-from benchmarks.made_frames import made_frames
-=======
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
-from arena_newton.policies.train.frames.frame_store import load_frames, made_frames
+from arena_newton.policies.train.frames.frame_store import load_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import train
->>>>>>> 93f2a41f704ba68bf60a7421b7bad137f401ec22
+from benchmarks.made_frames import made_frames
 from tests.children import Child
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network
