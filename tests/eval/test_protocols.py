@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -121,7 +122,7 @@ def here(monkeypatch, kept_worlds):
             codes.append(main(command[3:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
-    monkeypatch.setattr(protocol_comparison.subprocess, "run", call)
+    monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
     return codes
 
 
