@@ -89,6 +89,25 @@ class FakeEnv:
         """Nothing to release."""
 
 
+class PlacedEnv(FakeEnv):
+    """Football whose ball is where a sample says; a subclass ends its episodes by that."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.samples = [{"x": 0.0, "y": 0.0} for _ in range(self.worlds)]
+
+    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
+        super().reset(seeds, worlds, spawn=spawn)
+        for world, seed, sample in zip(worlds, seeds, samples, strict=True):
+            self.samples[world] = sample["football"]
+            self.played.append((seed, dict(sample["football"])))
+
+    @property
+    def places(self):
+        """Position of the ball in each world, shape [worlds, 2]."""
+        return np.array([(sample["x"], sample["y"]) for sample in self.samples])
+
+
 def _suffer(poison, seeds):
     """End or stop this process while it plays an episode that a text names, such as `die 17 hang 19`."""
     words = poison.split()

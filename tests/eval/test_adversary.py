@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEnv, factories
+from eval_fakes import PlacedEnv, factories
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.studies.placement_axes import Axis
@@ -25,31 +25,20 @@ def result(outcome, steps=10, margin=0.0):
     return EpisodeResult(SimpleNamespace(), outcome, outcome, steps, margin)
 
 
-class HoleEnv(FakeEnv):
+class HoleEnv(PlacedEnv):
     """Football that fails within 0.3 m of a hole, the nearer the worse, and succeeds everywhere else."""
 
     played: list = []
 
-    def __init__(self, *args, **options):
-        super().__init__(*args, **options)
-        self.samples = [(0.0, 0.0)] * self.worlds
-
-    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
-        """Keep the samples."""
-        super().reset(seeds, worlds, spawn=spawn)
-        for world, seed, sample in zip(worlds, seeds, samples, strict=True):
-            self.samples[world] = (sample["football"]["x"], sample["football"]["y"])
-            self.played.append((seed, self.samples[world]))
-
     def step(self, action, worlds=None):
         """End on the second tick with a success, or never."""
         self.tick[self.active] += 1
-        far = np.linalg.norm(np.array(self.samples) - HOLE, axis=1) > 0.3
+        far = np.linalg.norm(self.places - HOLE, axis=1) > 0.3
         return np.where(self.active & (self.tick > 1) & far, codes.SUCCESS, codes.RUNNING).astype(np.int32)
 
     def verdict(self, world):
         """Distance from the hole's rim."""
-        return Verdict(margin=float(np.linalg.norm(np.array(self.samples[world]) - HOLE)) - 0.3)
+        return Verdict(margin=float(np.linalg.norm(self.places[world] - HOLE)) - 0.3)
 
 
 def call(out, *flags):
@@ -141,11 +130,11 @@ def test_the_command_finds_the_hole(tmp_path, capsys):
     told = json.loads((tmp_path / "out" / "adversary.json").read_text())
     assert np.linalg.norm(np.array(told["worst"]["values"]) - HOLE) < 0.15
     assert (told["worst"]["success_rate"], told["confirmed"]["successes"], told["confirmed"]["episodes"]) == (0, 0, 6)
-    inside = [np.linalg.norm(np.array(where) - HOLE) <= 0.3 for _, where in HoleEnv.played[:40]]
+    inside = [np.linalg.norm((where["x"] - HOLE[0], where["y"] - HOLE[1])) <= 0.3 for _, where in HoleEnv.played[:40]]
     assert told["mean"]["successes"] == 40 - sum(inside) and told["mean"]["judged"] == 40
     assert len({seed for seed, _ in HoleEnv.played[:160]}) == 1
     assert len({seed for seed, _ in HoleEnv.played[160:]}) == 6
-    assert {where for _, where in HoleEnv.played[160:]} == {tuple(told["worst"]["values"])}
+    assert {(where["x"], where["y"]) for _, where in HoleEnv.played[160:]} == {tuple(told["worst"]["values"])}
     said = capsys.readouterr().out
     assert "mean over the range: " in said and "with new seeds: 0/6" in said
     with (tmp_path / "out" / "episodes.csv").open(newline="") as file:

@@ -85,6 +85,9 @@ def test_scenes_of_the_run_count():
     for name in ("boxing/scene.usda", "boxing/variants/semantic.usda", "g1/g1.usda", "textures/brick.png"):
         assert f"usd_scenes/{name}" in counted
     assert not any(name.split("/")[1] in (*TASKS[:5], "vis_navi", "lab") for name in counted)
+    one, other = (resolve(RunOptions(task=(task,))).identity() for task in ("football", "boxing"))
+    assert one["scenes"] != other["scenes"] and one["code"] == other["code"] and len(one["scenes"]) == 12
+    assert one["tracker_facts"] is None  # known when the tracker is made
 
 
 def test_a_new_folder_of_scenes_counts(tmp_path):

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from eval_fakes import FakeEnv, factories
+from eval_fakes import PlacedEnv, factories
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
@@ -17,27 +17,16 @@ from arena_newton.kernels import tick as codes
 PAPER = rule_sets.get("paper")
 
 
-class PlacedEnv(FakeEnv):
+class HalfEnv(PlacedEnv):
     """Football that succeeds where the ball's x is positive, falls where its y is above 1 and otherwise times out."""
 
     played: list = []
 
-    def __init__(self, *args, **options):
-        super().__init__(*args, **options)
-        self.samples = [{} for _ in range(self.worlds)]
-
-    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
-        """Keep the samples."""
-        super().reset(seeds, worlds, spawn=spawn)
-        for world, seed, sample in zip(worlds, seeds, samples, strict=True):
-            self.samples[world] = sample["football"]
-            self.played.append((seed, dict(sample["football"])))
-
     def step(self, action, worlds=None):
         """End on the second tick, by the placement."""
         self.tick[self.active] += 1
-        where = np.array([(sample.get("x", 0.0), sample.get("y", 0.0)) for sample in self.samples])
-        ends = np.where(where[:, 0] > 0, codes.SUCCESS, np.where(where[:, 1] > 1, codes.FALL, codes.RUNNING))
+        x, y = self.places.T
+        ends = np.where(x > 0, codes.SUCCESS, np.where(y > 1, codes.FALL, codes.RUNNING))
         return np.where(self.active & (self.tick > 1), ends, codes.RUNNING).astype(np.int32)
 
     def verdict(self, world):
@@ -47,8 +36,8 @@ class PlacedEnv(FakeEnv):
 
 def call(out, *flags):
     """Exit code of the command over the stand-ins."""
-    PlacedEnv.played.clear()
-    return main(["sensitivity", "--task", "football", "--out", str(out), *flags], factories(env=PlacedEnv))
+    HalfEnv.played.clear()
+    return main(["sensitivity", "--task", "football", "--out", str(out), *flags], factories(env=HalfEnv))
 
 
 def rows(path):
@@ -93,15 +82,15 @@ def test_a_sample_on_a_cylinder_stays_on_it():
 def test_the_grid_is_played_with_the_same_seeds_everywhere(tmp_path):
     """Every point gets each seed once; rates, falls and margins are those of its placement."""
     assert call(tmp_path / "out", "--grid", "3", "5", "--repeats", "2", "--worlds", "4", "--max-steps", "4") == 0
-    seeds = {seed for seed, _ in PlacedEnv.played}
-    assert len(seeds) == 2 and len(PlacedEnv.played) == 30
+    seeds = {seed for seed, _ in HalfEnv.played}
+    assert len(seeds) == 2 and len(HalfEnv.played) == 30
     points = rows(tmp_path / "out" / "sensitivity.csv")
     assert len(points) == 15
     for point in points:
         x, y = float(point["football.x"]), float(point["football.y"])
         assert (float(point["success_rate"]), int(point["falls"])) == (x > 0, 2 * (x <= 0 and y > 1))
         assert float(point["mean_margin"]) == float(point["least_margin"]) == pytest.approx(x)
-        here = [seed for seed, sample in PlacedEnv.played if (sample["x"], sample["y"]) == pytest.approx((x, y))]
+        here = [seed for seed, sample in HalfEnv.played if (sample["x"], sample["y"]) == pytest.approx((x, y))]
         assert sorted(here) == sorted(seeds)
     told = json.loads((tmp_path / "out" / "sensitivity.json").read_text())
     assert (told["successes"], told["judged"]) == (10, 30) and told["points"][0]["success_s"] is None
@@ -118,7 +107,7 @@ def test_files_do_not_depend_on_the_number_of_worlds(tmp_path):
 
 def test_what_was_played_is_kept(tmp_path, monkeypatch):
     """An interruption leaves the rows of all episodes that had ended."""
-    plain, ended = PlacedEnv.step, []
+    plain, ended = HalfEnv.step, []
 
     def stopped(self, action, worlds=None):
         if len(self.played) > 6:
@@ -126,7 +115,7 @@ def test_what_was_played_is_kept(tmp_path, monkeypatch):
         ended.append(1)
         return plain(self, action, worlds)
 
-    monkeypatch.setattr(PlacedEnv, "step", stopped)
+    monkeypatch.setattr(HalfEnv, "step", stopped)
     assert call(tmp_path / "out", "--grid", "3", "--worlds", "2", "--max-steps", "4") == 130
     assert len(rows(tmp_path / "out" / "episodes.csv")) in (5, 6)
 
@@ -137,7 +126,7 @@ def test_one_axis_is_a_map_of_one_row(tmp_path):
     assert [float(row["football.x"]) for row in rows(tmp_path / "out" / "sensitivity.csv")] == pytest.approx(
         [-1.2, -0.4, 0.4, 1.2]
     )
-    assert len({sample["y"] for _, sample in PlacedEnv.played}) == 1
+    assert len({sample["y"] for _, sample in HalfEnv.played}) == 1
 
 
 @pytest.mark.parametrize(
@@ -161,7 +150,7 @@ def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
     assert call(tmp_path / "out", *flags) == 2
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1
-    assert not (tmp_path / "out").exists() and not PlacedEnv.played
+    assert not (tmp_path / "out").exists() and not HalfEnv.played
 
 
 def test_a_folder_is_never_written_twice(tmp_path, capsys):
