@@ -46,6 +46,16 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if "mutants" in item.fixturenames]
 
 
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtestloop(session):
+    """Fork the server of tests' processes when all is imported and nothing is patched."""
+    if session.items:
+        from tests.children import fork_server
+
+        fork_server()
+    return (yield)
+
+
 @pytest.fixture(scope="session")
 def mutants(request) -> int:
     """Damaged files per reader."""

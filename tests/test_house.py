@@ -27,7 +27,6 @@ from tests.import_graph import (
     imports,
     modules,
     part_of,
-    statements,
     upward,
     upward_rooms,
 )
@@ -177,7 +176,7 @@ def test_private_names_stay_at_home():
     """No module imports or reads another one's private names."""
     found = []
     for module in known().values():
-        for statement, _ in statements(module.tree):
+        for statement, _ in module.running:
             if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, BENCHMARKS)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
@@ -186,7 +185,7 @@ def test_private_names_stay_at_home():
         own |= {n.name for n in module.nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
         own |= {n.id for n in module.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
         strangers = set()  # modules of other packages keep their own order
-        for statement, _ in statements(module.tree):
+        for statement, _ in module.running:
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
             for alias in statement.names:
                 if not (source or alias.name).startswith((PACKAGE, BENCHMARKS)):
@@ -254,7 +253,7 @@ def test_heavy_imports_stand_at_the_top():
     """Only what a `--help` or a plan loads imports heavy libraries late; it imports none at its top."""
     found, lights = [], loaded(f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING))
     for module in known().values():
-        for statement, late in statements(module.tree):
+        for statement, late in module.running:
             for name in sorted(tops(statement) & HEAVY):
                 if not late and module.name in lights:
                     found.append(
@@ -271,7 +270,7 @@ def test_lerobots_plug_in_is_light():
     found = [
         f"{place(known()[name], statement.lineno)}: {ast.unparse(statement)}"
         for name in loaded(f"{PACKAGE}.eval.adapters.lerobot_env")
-        for statement, late in statements(known()[name].tree)
+        for statement, late in known()[name].running
         if not late and tops(statement) & {"warp", "newton", "mujoco", "pxr"}
     ]
     report(found)
