@@ -10,10 +10,38 @@ import sys
 import tempfile
 import time
 import types
+from multiprocessing import forkserver, resource_tracker, util
 from pathlib import Path
 
+_WORLD = ["arena_newton.eval.play.run", "arena_newton.eval.suites.suite_run"]
 _SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(["arena_newton.eval.play.run", "arena_newton.eval.suites.suite_run"])
+_SERVER.set_forkserver_preload(_WORLD)
+
+
+def fork_server():
+    """Fork the server off this process, unless that has not imported the world, which takes 11 s, or holds a GPU."""
+    if not {*_WORLD} <= {*sys.modules} or sys.modules["warp"].is_cuda_available():
+        return
+    start = util.spawnv_passfds
+
+    def fork(_, __, files):
+        pid = os.fork()
+        if pid == 0:
+            try:
+                nothing = os.open(os.devnull, os.O_RDWR)
+                for file in {int(name) for name in os.listdir("/proc/self/fd")} - {1, 2, nothing, *files}:
+                    os.dup2(nothing, file)  # whoever reads at their other ends sees this process's end alone
+                forkserver.main(*files, [])
+            finally:
+                os._exit(0)
+        return pid
+
+    resource_tracker.ensure_running()
+    util.spawnv_passfds = fork
+    try:
+        forkserver.ensure_running()
+    finally:
+        util.spawnv_passfds = start
 
 
 class Child:

@@ -13,6 +13,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
+# Until all is imported: what that makes stays, and to look for garbage among it takes a quarter of the time.
+gc.disable()
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 # Before the package takes the root of a checkout off the path.
@@ -46,6 +49,19 @@ def pytest_collection_modifyitems(config, items):
         others = [item for item in items if "mutants" not in item.fixturenames]
         config.hook.pytest_deselected(items=others)
         items[:] = [item for item in items if "mutants" in item.fixturenames]
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtestloop(session):
+    """Fork the server of tests' processes when all is imported and nothing is patched; then look for garbage rarely."""
+    gc.set_threshold(50_000, 10, 10)
+    gc.enable()
+    gc.freeze()
+    if session.items:
+        from tests.children import fork_server
+
+        fork_server()
+    return (yield)
 
 
 @pytest.fixture(scope="session")

@@ -78,6 +78,30 @@ class Module:
         """Syntax tree, flat."""
         return list(ast.walk(self.tree))
 
+    @functools.cached_property
+    def statements(self) -> list[tuple[ast.Import | ast.ImportFrom, bool, bool]]:
+        """Import statements, and whether each is inside a function and whether it is for type checkers alone."""
+        found: list[tuple[ast.Import | ast.ImportFrom, bool, bool]] = []
+
+        def walk(nodes: Iterable[ast.AST], late: bool, checking: bool) -> None:
+            for node in nodes:
+                if isinstance(node, ast.Import | ast.ImportFrom):
+                    found.append((node, late, checking))
+                elif isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+                    walk(node.body, late, True)
+                    walk(node.orelse, late, False)
+                elif not isinstance(node, ast.expr):
+                    function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+                    walk(ast.iter_child_nodes(node), late or function, checking)
+
+        walk(self.tree.body, False, False)
+        return found
+
+    @property
+    def running(self) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+        """Import statements that run, and whether each is inside a function."""
+        return ((statement, late) for statement, late, checking in self.statements if not checking)
+
     @property
     def room(self) -> str:
         """Top-level folder."""
@@ -105,23 +129,6 @@ def modules(root: Path) -> dict[str, Module]:
     return found
 
 
-def statements(tree: ast.AST, *, checking: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Import statements that run, or those for type checkers, and whether each is inside a function."""
-
-    def walk(node: ast.AST, late: bool, runs: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.Import | ast.ImportFrom):
-                if runs != checking:
-                    yield child, late
-            elif isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
-                for part, others in ((child.body, False), (child.orelse, True)):
-                    yield from walk(ast.Module(part, []), late, others)
-            elif not isinstance(child, ast.expr):
-                yield from walk(child, late or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef), runs)
-
-    yield from walk(tree, False, True)
-
-
 def imported(statement: ast.Import | ast.ImportFrom, module: Module, known: dict[str, Module]) -> Iterator[str]:
     """Product modules that a statement imports."""
     if isinstance(statement, ast.Import):
@@ -145,7 +152,8 @@ def imports(known: dict[str, Module], *, checking: bool = False) -> list[Import]
     return [
         Import(module.name, target, statement.lineno, late, checking)
         for module in known.values()
-        for statement, late in statements(module.tree, checking=checking)
+        for statement, late, for_checkers in module.statements
+        if for_checkers == checking
         for target in imported(statement, module, known)
         if target != module.name
     ]

@@ -237,9 +237,9 @@ def load_official(mjcf: str | Path, drive: g1.DriveGains = g1.TWIST2_DRIVE, dt: 
 
 
 def action_streams(clips: Sequence[str | Path] = (), clip_seconds: float | None = None) -> list[ActionStream]:
-    """Standing 10 s, walking at 0.3 m/s, a squat to 0.45 m, and clips, of which `clip_seconds` keeps the start."""
+    """Standing 8 s, walking at 0.3 m/s, a squat to 0.45 m, and clips, of which `clip_seconds` keeps the start."""
     scripts = {
-        "stand 10 s": primitives.stand(10.0),
+        "stand 8 s": primitives.stand(8.0),
         "walk 0.3 m/s": primitives.walk(0.3, seconds=8.0),
         "squat to 0.45 m": primitives.squat(0.45),
     }

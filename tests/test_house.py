@@ -29,7 +29,6 @@ from tests.import_graph import (
     imports,
     modules,
     part_of,
-    statements,
     upward,
     upward_rooms,
 )
@@ -214,7 +213,7 @@ def test_private_names_stay_at_home():
     """No module imports or reads another one's private names."""
     found = []
     for module in known().values():
-        for statement, _ in statements(module.tree):
+        for statement, _ in module.running:
             if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, *OUTSIDE)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
@@ -223,7 +222,7 @@ def test_private_names_stay_at_home():
         own |= {n.name for n in module.nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
         own |= {n.id for n in module.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
         strangers = set()  # modules of other packages keep their own order
-        for statement, _ in statements(module.tree):
+        for statement, _ in module.running:
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
             for alias in statement.names:
                 if not (source or alias.name).startswith((PACKAGE, *OUTSIDE)):
@@ -292,7 +291,7 @@ def test_heavy_imports_stand_at_the_top():
     starts = [f"{top}.__main__" for top in OUTSIDE] + [f"{PACKAGE}.{start}" for start in STARTS + PLANNING]
     found, lights = [], loaded(*starts)
     for module in known().values():
-        for statement, late in statements(module.tree):
+        for statement, late in module.running:
             for name in sorted(tops(statement) & HEAVY):
                 if not late and module.name in lights:
                     found.append(
@@ -318,7 +317,7 @@ def test_light_modules_stay_light(modules):
     found = [
         f"{place(known()[name], statement.lineno)}: {ast.unparse(statement)}"
         for name in loaded(*(f"{PACKAGE}.{module}" for module in modules))
-        for statement, late in statements(known()[name].tree)
+        for statement, late in known()[name].running
         if not late and tops(statement) & LIGHT[modules]
     ]
     report(found)

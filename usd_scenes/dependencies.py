@@ -25,7 +25,7 @@ from arena_newton.files import limits, sandboxed_load
 from arena_newton.usd_scenes.counting import Arc, Contents, count_prims
 
 __all__ = ["LAYERS", "PACKAGE", "Dependencies", "Problem", "check_files", "collect", "layers", "probe_layers", "reason"]
-__all__ += ["search_context"]
+__all__ += ["search_context", "stamp"]
 
 LAYERS = (".usda", ".usd", ".usdc", ".usdz")
 """File types of a sublayer, reference or payload."""
@@ -192,7 +192,7 @@ def _read_layer(location: Location, shown: str, found: Dependencies, *, built_on
     if faults:
         found.fatal = True
     found.problems += [*units, *(Problem(shown, where, message) for where, message in faults)]
-    if built_on and not (units or faults) and location.file.resolve().is_relative_to(_ROOT / PACKAGE):
+    if built_on and not (units or faults) and location.file.resolve().is_relative_to((_ROOT / PACKAGE).resolve()):
         _OWN_CONTENTS[known] = contents
     return contents
 
@@ -234,8 +234,13 @@ _OWN_CONTENTS: dict[tuple[str, int, int, int], Contents] = {}
 
 
 def _known_as(location: Location) -> tuple[str, int, int, int]:
-    about = os.stat(location.file)
-    return str(location), about.st_ino, about.st_size, about.st_mtime_ns
+    return str(location), *stamp(location.file)
+
+
+def stamp(file: Path) -> tuple[int, int, int]:
+    """Inode, size [byte] and time of a file, by which the same one is known again."""
+    about = os.stat(file)
+    return about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _crate_fault(location: Location) -> str | None:

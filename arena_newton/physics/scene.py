@@ -31,6 +31,7 @@ from arena_newton.physics.ball import BALL, BALL_SKIN, add_skin, set_restitution
 from arena_newton.robot import g1
 from arena_newton.tasks.base import SCENES, Quat, Vec3
 from arena_newton.tasks.handles import ROBOT, BodyFrame, Latch, Marker, RobotHandles
+from arena_newton.usd_scenes.dependencies import layers, stamp
 from arena_newton.usd_scenes.shapes import check_buildable, open_stage
 
 if TYPE_CHECKING:
@@ -330,22 +331,28 @@ def _empty() -> newton.ModelBuilder:
     return builder
 
 
-_OWN: dict[tuple[Path, str | None, str, bool], newton.ModelBuilder] = {}
+_OWN: dict[tuple[object, ...], newton.ModelBuilder] = {}
 """Models as the importer made them of the project's own scenes: that takes nearly all of a scene's building."""
+_OTHERS: dict[tuple[object, ...], newton.ModelBuilder] = {}
+"""The last few of other scenes, by their files: a variant is checked, compared and played one after the other."""
+_MOST_OTHERS = 2
 
 
 def _imported(stage: Usd.Stage, path: Path, variant: str | None, hands: str, drawn: bool) -> newton.ModelBuilder:
-    """Model that Newton's importer makes of a stage; the project's own scenes are imported once per process."""
-    key = (path.resolve(), variant, hands, drawn)
-    if key in _OWN:
-        return copy.deepcopy(_OWN[key])
-    if not _is_own(path):
+    """Model that Newton's importer makes of a stage; the same files are imported once per process."""
+    own = _is_own(path)
+    kept, files = (_OWN, ()) if own else (_OTHERS, tuple(stamp(file) for file in layers(path)))
+    key = (path.resolve(), variant, hands, drawn, files)
+    if key in kept:
+        return copy.deepcopy(kept[key])
+    if not own:
         check_buildable(stage, path)
     template = _empty()
     with _naming(path):
         template.add_usd(stage, enable_self_collisions=False, collapse_fixed_joints=False, load_visual_shapes=drawn)
-    if _is_own(path):
-        _OWN[key] = copy.deepcopy(template)
+    if len(_OTHERS) == _MOST_OTHERS and not own:
+        del _OTHERS[next(iter(_OTHERS))]
+    kept[key] = copy.deepcopy(template)
     return template
 
 

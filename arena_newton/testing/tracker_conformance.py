@@ -7,6 +7,7 @@ among others, and next to robots that wait.
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
 import json
 import math
@@ -43,6 +44,7 @@ def _normalised(quat: np.ndarray) -> np.ndarray:
     return unit
 
 
+@functools.lru_cache(maxsize=1024)
 def _row(number: int, tick: int) -> dict[str, np.ndarray]:
     """A plausible command and state of one robot at one tick."""
     rng = np.random.default_rng([number, tick])

@@ -1,7 +1,6 @@
 """Football's ball bounces as the rule set says, at both physics rates and on both engines."""
 
 import dataclasses
-from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from arena_newton.physics.ball import BALL, BALL_SKIN, SKIN_HEIGHT, ball_solref,
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
 from arena_newton.robot.g1 import PhysicsRate
+from tests.scenes import scene
 
 HEIGHTS = np.array([0.3, 1.0, 3.0])
 """[m]."""
@@ -18,12 +18,6 @@ PHASES = np.array([0.05, 0.35, 0.65, 0.95])
 """Fractions of a physics step at which the ball meets the ground."""
 RADIUS, GRAVITY = 0.11, 9.81
 RATES = {0.001: PhysicsRate(0.001, 1), 0.005: PhysicsRate(0.005, 1)}
-
-
-@cache
-def one_world(rule_set: str):
-    """One world for native MuJoCo."""
-    return load_scene("football", device="cpu", native=True, rules=rule_sets.get(rule_set))
 
 
 @pytest.fixture(scope="module", params=["mujoco", "warp"])
@@ -80,7 +74,7 @@ def test_the_ball_rises_by_the_square_of_its_restitution(rule_set, rate):
     """Dropped from rest it rises to e² of each height: the root of their ratio is e ± 0.03."""
     import mujoco
 
-    built = one_world(rule_set)
+    built = scene("football", rules=rule_set)
     set_restitution(built, built.ball_restitution, rate)
     model, data = built.mj_model, mujoco.MjData(built.mj_model)
     model.opt.timestep = rate
@@ -116,7 +110,7 @@ def test_a_bouncing_ball_also_rolls_and_rests(rule_set):
     """The contact that bounces takes no speed from a rolling ball and keeps a resting one on the grass."""
     import mujoco
 
-    built = one_world(rule_set)
+    built = scene("football", rules=rule_set)
     model, q, v = built.mj_model, built.joint_qpos(BALL), built.joint_qvel(BALL)
     for rate in RATES:
         data = on_the_grass(built, rate)
@@ -131,7 +125,7 @@ def test_a_sliding_ball_stays_down(rule_set):
     """A ball that slides over the grass at 3 m/s, as after a kick, hops less than 5 mm and takes up its roll."""
     import mujoco
 
-    built = one_world(rule_set)
+    built = scene("football", rules=rule_set)
     model, q, v = built.mj_model, built.joint_qpos(BALL), built.joint_qvel(BALL)
     for rate in RATES:
         data = on_the_grass(built, rate)
@@ -152,4 +146,4 @@ def test_scene_keeps_the_rule_sets_restitution():
     assert built.mj_model.geom_condim[[geom, skin]].tolist() == [1, 3]
     assert built.ball_restitution == 0.75
     assert built.mj_model.geom_solref[geom] == pytest.approx(ball_solref(0.75, built.mj_model.opt.timestep))
-    assert load_scene("football", device="cpu", native=True).ball_restitution is None
+    assert scene("football").ball_restitution is None

@@ -270,31 +270,37 @@ def test_own_policies_conform(tmp_path):
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         for spec in ("stand", f"replay:{tmp_path / 'wave.npz'}", f"remote:http://127.0.0.1:{server.server_port}"):
-            assert all(result.ok for result in check_policy(policies.get(spec)))
+            policy = policies.get(spec)
+            policy.camera = CameraConfig(width=32, height=24, fit="native")  # noise of 640 x 480 takes seconds to send
+            assert all(result.ok for result in check_policy(policy))
     finally:
         server.shutdown()
         server.server_close()
 
 
-def test_experts_conform_in_real_worlds():
+@pytest.fixture
+def make_worlds():
+    """Builder of real worlds, and all that it built."""
+
+    def make(worlds):
+        env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", rules="released")
+        make.made.append(env)
+        return env
+
+    make.made = []
+    return make
+
+
+def test_experts_conform_in_real_worlds(make_worlds):
     """A policy that reads the world itself is tried in real worlds, which are closed afterwards."""
-    made = []
-
-    def make_worlds(worlds):
-        made.append(ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", rules="released"))
-        return made[-1]
-
     results = {r.name: r for r in check_policy(policies.get("expert"), task="boxing", make_worlds=make_worlds)}
     assert "not tried in real worlds" in results["errors"].message
-    assert [env.worlds for env in made] == [3, 1] and not any(env.active.any() for env in made)
+    assert [env.worlds for env in make_worlds.made] == [3, 1]
+    assert not any(env.active.any() for env in make_worlds.made)
 
 
-def test_a_policy_in_real_worlds_that_averages_is_found():
+def test_a_policy_in_real_worlds_that_averages_is_found(make_worlds):
     """Faults that made-up worlds find are found in real ones too."""
-
-    def make_worlds(worlds):
-        return ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", rules="released")
-
     results = check_policy(Crowd(), task="boxing", make_worlds=make_worlds, raises=False)
     assert {result.name for result in results if not result.ok} >= {"rows", "batch"}
 

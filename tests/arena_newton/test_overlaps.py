@@ -1,27 +1,20 @@
 """Nothing starts inside something else, but for the cases that the documentation lists."""
 
-from functools import cache
-
 import mujoco
 import numpy as np
 import pytest
 
 from arena_newton import rule_sets, tasks
-from arena_newton.physics.scene import Scene, load_scene
+from arena_newton.physics.scene import Scene
 from arena_newton.robot import g1
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import MODES
 from arena_newton.tasks.handles import ROBOT
+from tests.scenes import scene
 
 ALLOWED = 0.01
 """Penetration that physics undoes unseen [m]."""
 SEEDS = [(group, repeat) for group in range(3) for repeat in range(20)]
-
-
-@cache
-def scene(task: str, variant: str) -> Scene:
-    """One world for native MuJoCo."""
-    return load_scene(task, variant=variant, device="cpu", native=True)
 
 
 def thing(label: str) -> str:

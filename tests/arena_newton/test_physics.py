@@ -36,7 +36,7 @@ def both(football_native, football_warp):
 
 
 def test_same_forces_same_motion(football_native, football_warp, monkeypatch):
-    """Under the same torques on trunk and knees the two engines' roots stay within 1e-5 m for 120 steps of 1 ms."""
+    """Under the same torques on trunk and knees the two engines' roots stay within 1e-5 m for 80 steps of 1 ms."""
     off = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     torque = np.random.default_rng(0).uniform(-3, 3, (4, 3))
     roots = []
@@ -50,10 +50,10 @@ def test_same_forces_same_motion(football_native, football_warp, monkeypatch):
         force = physics.external_force.numpy()
         force[:, links, 3:] = torque
         physics.external_force.assign(force)
-        for _ in range(6):
+        for _ in range(4):
             physics.step()
         roots.append(physics.qpos.numpy()[:, scene.robot.root_qpos :][:, :3].copy())
-    assert roots[0][0, 2] < 0.75, "the robot should have fallen freely for a while"
+    assert roots[0][0, 2] < 0.78, "the robot should have fallen freely for a while"
     assert np.abs(roots[1] - roots[0][0]).max() < 1e-5
 
 

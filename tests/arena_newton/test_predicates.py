@@ -9,14 +9,8 @@ import pytest
 import warp as wp
 
 from arena_newton import rule_sets, tasks
-from arena_newton.physics.scene import Scene, load_scene
 from arena_newton.robot import g1
-
-
-@cache
-def scene(task: str) -> Scene:
-    """Built once per file, for both rule sets."""
-    return load_scene(task, device="cpu", native=True)
+from tests.scenes import scene
 
 
 class Bench:

@@ -107,9 +107,9 @@ def test_pictures_depend_on_the_episode_alone(env, tmp_path, monkeypatch):
 
     # What goes into the encoder: x264 itself is not the same to the byte twice in one process.
     monkeypatch.setattr(VideoWriter, "write", note)
-    record(env, tmp_path / "one", repeats=(1,), size=(96, 64))
-    record(environment(2), tmp_path / "two", repeats=(0, 1), size=(96, 64))
-    record(env, tmp_path / "strip", repeats=(1,), video=False)
+    record(env, tmp_path / "one", repeats=(1,), ticks=11, size=(96, 64))
+    record(environment(2), tmp_path / "two", repeats=(0, 1), ticks=11, size=(96, 64))
+    record(env, tmp_path / "strip", repeats=(1,), ticks=11, video=False)
     one, two, strip = files(tmp_path / "one"), files(tmp_path / "two"), files(tmp_path / "strip")
     assert len(one) == 4 and len(strip) == 2
     assert set(one) == {name for name in two if "repeat1" in name}

@@ -12,6 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import MODES, PoseRange
 from arena_newton.tasks.base import light_direction, widened
+from tests.scenes import scene
 
 PAPER, RELEASED = rule_sets.get("paper"), rule_sets.get("released")
 
@@ -347,25 +348,19 @@ def test_a_box_of_several_solids_is_judged_whole(tmp_path):
         (None, (0.0, 0.0, 0.105), (0.105, 0.105, 0.105)),
         (layer, (0.02, 0.0, 0.125), (0.125, 0.105, 0.125)),
     ):
-        scene = load_scene("pp_box", variant_file=variant_file, device="cpu", native=True)
-        box = tasks.get("pp_box").judge(scene, PAPER).box
+        built = load_scene("pp_box", variant_file=variant_file, device="cpu", native=True)
+        box = tasks.get("pp_box").judge(built, PAPER).box
         assert box.pos.numpy()[0] == pytest.approx(centre, abs=1e-6)
         assert box.half.numpy()[0] == pytest.approx(half, abs=1e-6)
 
 
 def test_the_pelvis_alone_counts_as_two_on_the_sofa():
     """`released` lists the pelvis with its contour, which the original's robot carries as a body in its place."""
-    from arena_newton.physics.scene import load_scene
-
-    scene = load_scene("sit_sofa", device="cpu", native=True)
-    counted = tasks.get("sit_sofa").judge(scene, RELEASED).touching.numpy().tolist()
-    assert counted.count(scene.link("pelvis")) == 2 and len(counted) == 11 and len(set(counted)) == 10
+    counted = tasks.get("sit_sofa").judge(scene("sit_sofa"), RELEASED).touching.numpy().tolist()
+    assert counted.count(scene("sit_sofa").link("pelvis")) == 2 and len(counted) == 11 and len(set(counted)) == 10
 
 
 @pytest.mark.parametrize(("variant", "rule_set", "ring"), [("semantic", RELEASED, True), ("semantic", PAPER, False)])
 def test_only_released_reads_the_ring_as_a_disc(variant, rule_set, ring):
     """The semantic sign's zone is a disc for `released`, its bounding box for `paper`."""
-    from arena_newton.physics.scene import load_scene
-
-    scene = load_scene("vis_navi", variant=variant, device="cpu", native=True)
-    assert tasks.get("vis_navi").judge(scene, rule_set).round is ring
+    assert tasks.get("vis_navi").judge(scene("vis_navi", variant), rule_set).round is ring

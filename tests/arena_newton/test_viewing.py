@@ -33,10 +33,9 @@ class Episode:
     group_seed: int = 0
 
 
-@pytest.fixture(scope="module", params=["mujoco", "warp"])
-def env(request):
-    """Football on both engines."""
-    env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=WORLDS, engine=request.param, device="cpu")
+def football(engine):
+    """Football on an engine, and then its end."""
+    env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=WORLDS, engine=engine, device="cpu")
     yield env
     env.close()
 
@@ -44,9 +43,19 @@ def env(request):
 @pytest.fixture(scope="module")
 def native():
     """Football on native MuJoCo."""
-    env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=WORLDS, engine="mujoco", device="cpu")
-    yield env
-    env.close()
+    yield from football("mujoco")
+
+
+@pytest.fixture(scope="module")
+def batched():
+    """Football on MuJoCo Warp."""
+    yield from football("warp")
+
+
+@pytest.fixture(params=["native", "batched"])
+def env(request):
+    """Football on both engines."""
+    return request.getfixturevalue(request.param)
 
 
 def play(env, *recorders, ticks=TICKS):
@@ -236,7 +245,7 @@ def test_replay_with_a_viewer_has_the_same_identity(tmp_path):
     actions = tmp_path / "stand.npz"
     np.savez(actions, action=np.tile(STAND_ACTION, (8, 1)))
     flags = ["run", "--task", "football", "--policy", f"replay:{actions}", "--seeds", "0", "--repeats", "1"]
-    flags += ["--max-steps", "6", "--engine", "mujoco", "--device", "cpu"]
+    flags += "--max-steps 6 --engine mujoco --device cpu --tracker pd --rules released".split()
     assert main([*flags, "--out", str(tmp_path / "plain")]) == 0
     assert main([*flags, "--out", str(tmp_path / "shown"), "--viewer", "usd", "--viewer-failures"]) == 0
     read = [json.loads((tmp_path / name / "config.json").read_text()) for name in ("plain", "shown")]

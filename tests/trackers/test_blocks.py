@@ -71,8 +71,8 @@ def test_many_rows_are_divided_among_threads(monkeypatch, worlds):
     used = set()
     runner.input.copy_(rows)
     runner.plan()
-    product = runner._product
-    runner._product = lambda part: used.add(len(part)) or product(part)
+    product = runner._exported.product
+    runner._exported.product = lambda part: used.add(len(part)) or product(part)
     assert torch.equal(runner.run(), whole)
     assert max(used) <= -(-worlds // 3) + 1
 

@@ -1,23 +1,15 @@
 """The football, two-desk and box scenes: what the layers say and how their things behave in MuJoCo."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.physics.scene import Scene, load_scene
 from scene_builders import author, rooms, textures
 from scene_builders.__main__ import build_all
+from tests.scenes import scene
 
 SCENES = tuple(name for name in tasks.names() if tasks.get(name).suite == "HOI")
-
-
-@cache
-def scene(task: str, variant: str = "base") -> Scene:
-    """A one-world scene for native MuJoCo."""
-    return load_scene(task, variant=variant, device="cpu", native=True)
 
 
 def start(task: str, *, dt: float = 0.005, variant: str = "base"):

@@ -15,9 +15,13 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 import warnings
+import weakref
+import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import onnxruntime
@@ -108,6 +112,30 @@ def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-
     return run
 
 
+@dataclass
+class _Exported:
+    """A network in ONNX Runtime, and its plan once that was asked for."""
+
+    numbers: int
+    """Checksum of the weights that were exported."""
+    product: Network
+    plan: tuple[int, bool] | None = None
+
+
+_EXPORTED: weakref.WeakKeyDictionary[torch.nn.Module, _Exported] = weakref.WeakKeyDictionary()
+"""Networks as they were exported last: one that is bound again runs as before, unless its weights have changed."""
+
+
+def _exported(network: torch.nn.Module, width: int) -> _Exported:
+    numbers = 0
+    for tensor in itertools.chain(network.parameters(), network.buffers()):
+        numbers = zlib.crc32(tensor.detach().reshape(-1).view(torch.uint8).numpy(), numbers)
+    known = _EXPORTED.get(network)
+    if known is None or known.numbers != numbers:
+        known = _EXPORTED[network] = _Exported(numbers, compiled(network, (8, width)))
+    return known
+
+
 class BlockRunner:
     """Runs a network on `worlds` rows with results that are bit-identical for any number and order of rows (CPU).
 
@@ -138,8 +166,7 @@ class BlockRunner:
         padding = max(_BLOCK_SIZES) if self.fixed else 1
         self._buffer = torch.zeros(-(-worlds // padding) * padding, in_width, device=self.device)
         self.input = self._buffer[:worlds]
-        self._product: Network | None = torch.inference_mode()(network) if on_host or not self.fixed else None
-        self._plan: tuple[int, bool] | None = None
+        self._exported = _Exported(0, torch.inference_mode()(network)) if on_host or not self.fixed else None
         self._planned: Callable[[], torch.Tensor] | None = None
         threads = min(torch.get_num_threads(), worlds // _ROWS_PER_THREAD)
         self._pool = ThreadPoolExecutor(threads) if self.fixed and threads > 1 else None
@@ -160,7 +187,7 @@ class BlockRunner:
 
     def _as_planned(self) -> Callable[[], torch.Tensor]:
         """A run with everything that is the same each time done beforehand."""
-        product, worlds = self._compile(), self.worlds
+        product, worlds = self._compile().product, self.worlds
         block, merged = self.plan()
         rows = self._buffer[: -(-worlds // block) * block]
         if not merged:
@@ -172,21 +199,22 @@ class BlockRunner:
         run = product.bound(rows) if isinstance(product, OnnxProduct) else functools.partial(product, rows)
         return run if len(rows) == worlds else lambda: run()[:worlds]
 
-    def _compile(self) -> Network:
-        if self._product is None:
-            self._product = compiled(self.network, (8, self._buffer.shape[1]))
-        return self._product
+    def _compile(self) -> _Exported:
+        if self._exported is None:
+            self._exported = _exported(self.network, self._buffer.shape[1])
+        return self._exported
 
     @torch.inference_mode()
     def plan(self) -> tuple[int, bool]:
         """Block size, and whether all blocks may run as one product; the same for every number of worlds."""
-        if self._plan is None:
-            product, width = self._compile(), self._buffer.shape[1]
+        exported = self._compile()
+        if exported.plan is None:
             generator = torch.Generator().manual_seed(_PROBE_SEED)
-            kept = (block for block in _BLOCK_SIZES if _keeps_bits(product, block, width, generator))
+            width = self._buffer.shape[1]
+            kept = (block for block in _BLOCK_SIZES if _keeps_bits(exported.product, block, width, generator))
             block = next(kept, None)
-            self._plan = (1, False) if block is None else (block, True)
-        return self._plan
+            exported.plan = (1, False) if block is None else (block, True)
+        return exported.plan
 
 
 def _keeps_bits(product: Network, block: int, width: int, generator: torch.Generator) -> bool:

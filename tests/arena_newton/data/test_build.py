@@ -178,6 +178,7 @@ def test_lerobots_loader_and_merge_take_it(dataset, recordings, tmp_path):
     assert both.num_episodes == 4 and len(both) == len(read) + ROWS
 
 
+@pytest.mark.release
 def test_bytes_do_not_depend_on_the_hash_seed(dataset, recordings, tmp_path):
     """Another process with another PYTHONHASHSEED, and files in another order, write the same bytes."""
     files = sorted(map(str, episode_files([recordings])), reverse=True)
@@ -198,13 +199,14 @@ def umask():
 def record(folder, worlds):
     """Three short episodes of a standing robot, in so many worlds."""
     env = ArenaEnv("boxing", tracker=trackers.get("twist2", None), worlds=worlds, engine="mujoco")
+    env.startup_ticks = 2
     episodes = []
     for repeat in range(3):
         seed = seeding.recording_seed(env.spec.gym_id, seeding.DEMONSTRATION, 0, repeat)
         about = {"task": "boxing", "tracker": "twist2", "policy": "stand", "mode": "base", "rules": "paper"}
         seeds = {"episode_seed": seed, "object_seed": seeding.object_seed(seed)}
         episodes.append(SimpleNamespace(index=repeat, group_seed=0, repeat=repeat, **about, **seeds))
-    recorder = DemonstrationRecorder(folder, cameras={"front": CameraConfig(width=64, height=64)}, facts={"code": "x"})
+    recorder = DemonstrationRecorder(folder, cameras={"front": CameraConfig(width=32, height=32)}, facts={"code": "x"})
     list(Rollout(env, StandPolicy(), episodes, max_steps=12, recorder=recorder).run())
     recorder.close()
     return folder
@@ -256,7 +258,7 @@ def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_pa
     assert content(out) == whole
     shutil.rmtree(out)
     unfinished = 0
-    for number in range(6):
+    for number in range(4):
         # The first one at once: it certainly meets a build at work.
         _, left = build_and_kill(recordings, out, chance.uniform(0.0, 1.1 * duration) if number else 0.0)
         unfinished += left
@@ -365,11 +367,10 @@ def test_files_are_as_small_as_asked(tmp_path, monkeypatch):
 
     monkeypatch.setattr(made_episodes, "pictures", noise)
     for repeat in range(4):
-        consistent_episode(tmp_path / "r", ROWS, repeat=repeat, size=224)
-    (size,) = {round(file.stat().st_size / 2**20, 1) for file in (tmp_path / "r" / "videos").iterdir()}
-    assert 0.67 < size < 1.0
-    for file_mb, files in ((1, 4), (2, 2), (100, 1)):
-        built = written(tmp_path / "r", tmp_path / f"d{file_mb}", file_mb=file_mb)
+        consistent_episode(tmp_path / "r", ROWS, repeat=repeat, size=64)
+    size = max(file.stat().st_size for file in (tmp_path / "r" / "videos").iterdir()) / 2**20
+    for most, files in ((1.5 * size, 4), (2.5 * size, 2), (100, 1)):
+        built = written(tmp_path / "r", tmp_path / f"d{files}", file_mb=most)
         assert len(list((built / "videos").rglob("*.mp4"))) == files
         read = LeRobotDataset("local/many", root=built, return_uint8=True, video_backend="pyav")
         assert read[ROWS]["observation.images.front"].float().std() > 20.0

@@ -78,7 +78,7 @@ def test_bytes_are_those_of_threads_and_of_neither(tmp_path):
 
 def test_dropped_films_leave_no_file(tmp_path):
     """Films dropped in the middle are gone, and the pool takes other pictures afterwards."""
-    pool = EncoderPool(2, 1)
+    pool = EncoderPool(1, 1)
     streams = begin(pool, tmp_path)
     pool.add("front", streams, *pictures(0))
     pool.wait()
@@ -92,7 +92,7 @@ def test_dropped_films_leave_no_file(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path):
     """The error of a process arrives with number and file; the episode has no films, the others have theirs."""
-    pool = EncoderPool(2, 1)
+    pool = EncoderPool(1, 1)
     pool.bind({"front": Pictured(2, SIZE, SIZE, False)}, CPU)
     (tmp_path / "file").touch()
     whole = pool.open(pool.join(), tmp_path / "a.mp4", tmp_path / "a.raw", 50)
@@ -190,7 +190,7 @@ def test_an_interrupt_tears_no_message(tmp_path, monkeypatch, torn):
     def late(number, frame):
         raise TimeoutError("the pool waits for a message that was lost")
 
-    pool, facts, interrupts = EncoderPool(2, 1), [], 0
+    pool, facts, interrupts = EncoderPool(1, 1), [], 0
     streams = begin(pool, tmp_path)
     monkeypatch.setattr(EncoderPool, torn, interrupted)
     before = signal.signal(signal.SIGALRM, late)

@@ -29,7 +29,7 @@ from original_dataset import write_dataset
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """Recordings of two tasks and trackers, each as a dataset of its own, and both as one."""
+    """Recordings of two tasks and trackers, each as a dataset of its own, both as one, and both datasets merged."""
     folder = tmp_path_factory.mktemp("built")
     for repeat in range(3):
         make_episode(folder / "ra", 30 + repeat, repeat=repeat)
@@ -37,6 +37,7 @@ def built(tmp_path_factory):
         make_episode(folder / "rb", 20 + repeat, repeat=repeat, task="football", tracker="sonic")
     for name, recordings in {"a": ["ra"], "b": ["rb"], "both": ["ra", "rb"]}.items():
         assert main(["build", *(str(folder / one) for one in recordings), "--out", str(folder / name)]) == 0
+    assert main(["merge", str(folder / "a"), str(folder / "b"), "--out", str(folder / "merged")]) == 0
     return folder
 
 
@@ -65,10 +66,9 @@ def near(one, other):
     return one == other or (isinstance(one, float) and abs(one - other) <= 1e-6 * max(1.0, abs(one)))
 
 
-def test_merged_is_built_together(built, tmp_path):
+def test_merged_is_built_together(built):
     """Two datasets merged are, in rows, pictures, statistics and description, that of all recordings built at once."""
-    out = tmp_path / "merged"
-    assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(out)]) == 0
+    out = built / "merged"
     assert rows(out).equals(rows(built / "both"))
     np.testing.assert_array_equal(pictures(out), pictures(built / "both"))
     files, wanted = DatasetFiles(out), DatasetFiles(built / "both")
@@ -96,8 +96,7 @@ def test_seeds_of_evaluations_among_others_are_told(built, tmp_path, capsys):
 def test_merged_passes_verify(built, tmp_path, capsys):
     """`data verify` finds no fault in a merged set, nor in either side of a split."""
     pytest.importorskip("arena_newton.data.checks.verification")
-    out = tmp_path / "merged"
-    assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(out)]) == 0
+    out = built / "merged"
     train, held = tmp_path / "train", tmp_path / "held"
     split = ["split", str(out), "--fraction", "0.4", "--out-train", str(train), "--out-held-out", str(held)]
     assert main(split) == 0
@@ -116,11 +115,10 @@ def test_equal_sources_give_equal_bytes(built, tmp_path):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
 
 
-def test_lerobot_reads_what_was_merged(built, tmp_path):
+def test_lerobot_reads_what_was_merged(built):
     """LeRobot's own loader gives the rows and pictures of the sources."""
     lerobot_dataset = pytest.importorskip("lerobot.datasets.lerobot_dataset")
-    out = tmp_path / "merged"
-    assert main(["merge", str(built / "a"), str(built / "b"), "--out", str(out)]) == 0
+    out = built / "merged"
     dataset = lerobot_dataset.LeRobotDataset("local/x", root=out, video_backend="pyav")
     assert (len(dataset), dataset.num_episodes) == (134, 5)
     shown = pictures(out)

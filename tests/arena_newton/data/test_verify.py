@@ -331,8 +331,8 @@ def test_the_first_mismatch_is_that_of_any_number_of_threads(many_files, tmp_pat
     without_last_frame(spoiled, videos[1])
     for video in videos[2:]:
         (spoiled / video).write_bytes(b"no video")
-    for jobs in (1, 2, 8, 8):
-        verify([sound], VerifyOptions(recordings=(recordings,), jobs=jobs))
+    verify([sound], VerifyOptions(recordings=(recordings,), jobs=8))
+    for jobs in (1, 2, 8):
         with pytest.raises(DatasetMismatch, match=r"file-001\.mp4, episode 1, row 39: the video has no frame for it"):
             verify([spoiled], VerifyOptions(recordings=(recordings,), jobs=jobs))
 
