@@ -26,5 +26,5 @@ def test_how_a_process_ended():
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert not process.stdout.read()
         assert how_it_ended(process, 0.05) == "it closed its output"
-        threading.Timer(1.5, process.kill).start()
+        threading.Timer(0.3, process.kill).start()
         assert how_it_ended(process, 60.0) == "SIGKILL; out of memory?"
