@@ -37,6 +37,7 @@ __all__ = [
     "results_folder",
     "setting",
     "stored_options",
+    "timestamp",
 ]
 
 EPISODES = "episodes"
@@ -216,17 +217,17 @@ class ResultsFolder:
         Bad input that shows in the block refuses the run: the status stays what it was.
         """
         before = self.document.get("status")
-        status: documents.Status = {"state": "started", "started_at": _now(), "finished_at": None, "error": None}
+        status: documents.Status = {"state": "started", "started_at": timestamp(), "finished_at": None, "error": None}
         self.document["status"] = status
         self._save()
         try:
             yield
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
-                self.document["status"] = status | {"state": "cancelled", "finished_at": _now()}
+                self.document["status"] = status | {"state": "cancelled", "finished_at": timestamp()}
             elif not isinstance(error, InputError):
                 text = plain_text(error, 400) or type(error).__name__
-                self.document["status"] = status | {"state": "error", "finished_at": _now(), "error": text}
+                self.document["status"] = status | {"state": "error", "finished_at": timestamp(), "error": text}
             elif before is not None:
                 self.document["status"] = before
             else:
@@ -234,14 +235,14 @@ class ResultsFolder:
             with contextlib.suppress(ArenaError):  # on a full disk the first error is the one to report
                 self._save()
             raise
-        self.document["status"] = status | {"state": "success", "finished_at": _now()}
+        self.document["status"] = status | {"state": "success", "finished_at": timestamp()}
         self._save()
 
     def finished(self) -> None:
         """Every planned episode is in the journal, and none was played: a killed run may have left another status."""
         status = self.document.get("status")
         if status is not None and status["state"] != "success":
-            self.document["status"] = status | {"state": "success", "finished_at": _now(), "error": None}
+            self.document["status"] = status | {"state": "success", "finished_at": timestamp(), "error": None}
             self._save()
 
     def register(self, group: str, facts: Mapping[str, object]) -> JsonObject:
@@ -296,7 +297,8 @@ class ResultsFolder:
                     part.unlink()
 
 
-def _now() -> str:
+def timestamp() -> str:
+    """This moment as ISO 8601 in UTC."""
     return iso(datetime.datetime.now(datetime.UTC).timestamp())
 
 

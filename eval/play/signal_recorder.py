@@ -20,7 +20,7 @@ from arena_newton.robot.g1 import LEGS
 from arena_newton.robot.rotations import quat_apply
 from arena_newton.rules.rule_types import FallRule
 
-__all__ = ["EVERY", "SEEN", "SignalRecorder"]
+__all__ = ["EVERY", "SEEN", "SignalRecorder", "shapes_of"]
 
 EVERY = 25
 """Ticks between two looks: half a second, in which the head turns by half its field of view at most."""
@@ -59,7 +59,7 @@ class SignalRecorder(Recorder):
         self._legs = torch.tensor(list(LEGS), device=device)
         self._reference = wp.to_torch(env.loop.reference.position)
         self._camera: Camera | None = None
-        self._shapes = _shapes_of(env, self.spec.sight)
+        self._shapes = shapes_of(env, self.spec.sight)
         self._ended: dict[int, EpisodeSignals] = {}
         worlds = env.worlds
         self._now = {name: torch.full((worlds,), value, device=device) for name, value in _BEGIN.items()}
@@ -211,7 +211,7 @@ _BEGIN |= dict.fromkeys("nearest_distance reach_distance stop_distance height_mi
 """Running number → its value before an episode's step 0; -1 and `FAR` mean that there is none yet."""
 
 
-def _shapes_of(env: World, prim: str) -> Tensor:
+def shapes_of(env: World, prim: str) -> Tensor:
     """Shapes of the model that belong to a prim, bool, shape [shapes]."""
     labels = env.scene.model.shape_label
     return torch.tensor([f"{label}/".startswith(f"{prim}/") for label in labels], device=env.torch_device)

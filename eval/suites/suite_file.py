@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -162,7 +162,7 @@ def read_suite_file(path: Path) -> SuiteFile:
         InputError: It is no TOML, or a table, key or value is unknown; the message names file, table and key.
     """
     content, digest = _toml(path)
-    _only_known(str(path), content, TABLES)
+    _check_names(str(path), content, TABLES)
     name = content.get("name", path.stem)
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9+_.-]{1,64}", name) or name.startswith("."):
         raise InputError(f"{path}: name is {shown(name)}, expected letters, digits, _ - + and dots")
@@ -238,12 +238,6 @@ def _check_plain(where: str, value: object, depth: int = 0) -> None:
             raise InputError(f"{where}: {plain_text(value, 60)} is neither text nor number, true, false, list or table")
 
 
-def _only_known(where: str, content: Mapping[str, Json], known: Sequence[str]) -> None:
-    for key in content:
-        if key not in known:
-            raise InputError(f"{where}: {plain_text(key, 60)} is unknown, known are {' '.join(known)}")
-
-
 def _table(path: Path, content: Mapping[str, Json], key: str) -> JsonObject:
     value = content.get(key, {})
     if not isinstance(value, dict):
@@ -266,7 +260,7 @@ def _values(where: str, table: Mapping[str, Json], kind: type) -> JsonObject:
 
 def _defaults(path: Path, table: Mapping[str, Json]) -> JsonObject:
     where = f"{path}: [defaults]"
-    _only_known(where, table, CONDITIONS)
+    _check_names(where, table, CONDITIONS)
     return _values(where, table, RunOptions)
 
 
@@ -308,7 +302,7 @@ def _check_axes(where: str, axes: MatrixAxes | PolicyEntry, *, required: bool = 
             raise InputError(f"{where}: latency is {latency}, expected 0 to {MAX_LATENCY} ticks")
 
 
-def _check_names(where: str, values: Sequence[str], known: Sequence[str]) -> None:
+def _check_names(where: str, values: Iterable[str], known: Sequence[str]) -> None:
     for value in values:
         if value not in known:
             raise InputError(f"{where}: {plain_text(value, 60)} is unknown, known are {' '.join(known)}")
@@ -372,7 +366,7 @@ def _rule(where: str, table: Mapping[str, Json]) -> CellRule:
     ((kind, chosen),) = table.items()
     if not isinstance(chosen, dict) or not chosen:
         raise InputError(f'{where}: {kind} is {shown(chosen)}, expected a table such as {{ task = "boxing" }}')
-    _only_known(f"{where}: {kind}", chosen, SELECTORS)
+    _check_names(f"{where}: {kind}", chosen, SELECTORS)
     found = {}
     for key, value in chosen.items():
         parts = value if isinstance(value, list) else [value]

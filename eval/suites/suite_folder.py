@@ -14,7 +14,7 @@ from typing import TypedDict
 
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run
-from arena_newton.eval.folders.run_folder import iso
+from arena_newton.eval.folders.run_folder import timestamp
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.identity import differing_key, moving_versions
@@ -218,7 +218,7 @@ class SuiteFolder:
 
     def reopen(self, name: str) -> None:
         """Journal that what was played of a cell counts no more."""
-        self.add(CellEvent(cell=name, event="reopened", at=_now()))
+        self.add(CellEvent(cell=name, event="reopened", at=timestamp()))
 
 
 def _knowing(cells: Sequence[SuiteCell], known: Mapping[str, SuiteCell]) -> Iterator[SuiteCell]:
@@ -251,8 +251,4 @@ def _killed(begun: CellEvent, run: RunRecord | None) -> CellEvent:
         with contextlib.suppress(ValueError):
             at = [datetime.datetime.fromisoformat(text) for text in (begun.at, last)]
             wall = (at[1] - at[0]).total_seconds()
-    return CellEvent(cell=begun.cell, event="killed", at=_now(), device=begun.device, wall_s=wall, **_counts(run))
-
-
-def _now() -> str:
-    return iso(datetime.datetime.now(datetime.UTC).timestamp())
+    return CellEvent(cell=begun.cell, event="killed", at=timestamp(), device=begun.device, wall_s=wall, **_counts(run))

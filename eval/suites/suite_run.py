@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 import io
 import time
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,7 @@ from arena_newton import doctor
 from arena_newton.cli.flags import shell_command
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.folders.run_folder import ResultsFolder, iso, setting
+from arena_newton.eval.folders.run_folder import ResultsFolder, setting, timestamp
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.options import Workers, flags_of
 from arena_newton.eval.play.env_cache import EnvCache
@@ -249,7 +248,9 @@ class CellPlayer:
     def begun(self, name: str, device: str) -> None:
         """Journal that a cell begins on a device."""
         self.devices[name] = device
-        self.folder.add(CellEvent(cell=name, event="begun", at=_now(), config=self.configs[name].hash, device=device))
+        self.folder.add(
+            CellEvent(cell=name, event="begun", at=timestamp(), config=self.configs[name].hash, device=device)
+        )
 
     def ended(self, name: str, code: int, error: Exception | None, wall: float, left: Sequence[str]) -> bool:
         """Journal and say how a cell ended.
@@ -296,7 +297,7 @@ class CellPlayer:
             CellEvent(
                 cell=name,
                 event=kind,
-                at=_now(),
+                at=timestamp(),
                 config=self.configs[name].hash,
                 device=self.devices.get(name, ""),
                 wall_s=round(wall, 3),
@@ -341,7 +342,3 @@ def _named(suite: SuiteFile, name: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{suite.path}: cell {name}: {error}") from None
-
-
-def _now() -> str:
-    return iso(datetime.datetime.now(datetime.UTC).timestamp())

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from arena_newton.data.readers.label_protocols import protocol
 from arena_newton.errors import InputError
@@ -50,7 +50,7 @@ class CheckpointFacts:
     """Width of the head camera's picture [px]."""
     height: int = 224
     """Height of the head camera's picture [px]."""
-    fit: Literal["pad", "native"] = "pad"
+    fit: Annotated[str, Fit("pad or native", lambda value: value in ("pad", "native"))] = "pad"
     """`pad` or `native`, as in `CameraConfig`."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given as `observation.environment_state`; none: it
@@ -90,7 +90,7 @@ class CheckpointFacts:
     @property
     def camera(self) -> CameraConfig:
         """The picture that the policy wants."""
-        return CameraConfig(width=self.width, height=self.height, fit=self.fit)
+        return CameraConfig(width=self.width, height=self.height, fit="native" if self.fit == "native" else "pad")
 
     def write(self, folder: Path) -> None:
         """Write the file of a checkpoint."""

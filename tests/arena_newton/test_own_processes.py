@@ -2,9 +2,10 @@
 
 import subprocess
 import sys
+import threading
 
 import arena_newton
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended
 
 
 def test_a_process_finds_this_package(tmp_path, monkeypatch):
@@ -17,3 +18,13 @@ def test_a_process_finds_this_package(tmp_path, monkeypatch):
     command = [sys.executable, "-P", "-c", code]
     found = subprocess.run(command, env=environment(), cwd=tmp_path, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == arena_newton.__file__
+
+
+def test_how_a_process_ended():
+    """The signal of a process that ends slowly is waited for; one that only closed its output has no exit code."""
+    code = "import os, time; os.close(1); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert not process.stdout.read()
+        assert how_it_ended(process, 0.05) == "it closed its output"
+        threading.Timer(0.3, process.kill).start()
+        assert how_it_ended(process, 60.0) == "SIGKILL; out of memory?"

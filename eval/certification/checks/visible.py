@@ -14,6 +14,7 @@ from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
+from arena_newton.eval.play.signal_recorder import shapes_of
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.kernels.tick import RUNNING
@@ -114,7 +115,7 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
     policy.attach(env)
     env.reset(seeds)
     policy.reset([seeding.policy_seed(seed) for seed in seeds], [env.spec.gym_id] * env.worlds)
-    shapes = _shapes_of(env, prim)
+    shapes = shapes_of(env, prim)
     first: list[int | None] = [None] * env.worlds
     pixels, image = [0] * env.worlds, None
     longest = min(env.budget, LONGEST)
@@ -139,12 +140,6 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
         over = env.active & ((status != RUNNING) | (env.tick >= longest))
         env.release(np.flatnonzero(over))
     return first, pixels, image
-
-
-def _shapes_of(env: World, prim: str) -> torch.Tensor:
-    """Shapes of the model that belong to a prim, bool, shape [shapes]."""
-    labels = env.scene.model.shape_label
-    return torch.tensor([f"{label}/".startswith(f"{prim}/") for label in labels], device=env.torch_device)
 
 
 def _counts(env: World, looks: np.ndarray, shapes: torch.Tensor) -> list[tuple[int, int, np.ndarray]]:

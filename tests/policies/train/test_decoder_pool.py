@@ -6,9 +6,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
-import threading
 import time
 from pathlib import Path
 
@@ -151,18 +148,6 @@ def test_a_process_that_dies_is_an_error(rows):
 
         list(pool.decode(films, 0, 0, put))
     assert not decoders() and not shared_files()
-
-
-def test_how_a_process_ended(monkeypatch):
-    """The signal of a process that ends slowly is waited for; one that only closed its output has no exit code."""
-    monkeypatch.setattr(decoder_pool, "DEATH_PATIENCE", 0.05)
-    code = "import os, time; os.close(1); time.sleep(600)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
-        assert not process.stdout.read()
-        assert decoder_pool._how(process) == "it closed its output"
-        monkeypatch.undo()
-        threading.Timer(0.3, process.kill).start()
-        assert decoder_pool._how(process) == "SIGKILL; out of memory?"
 
 
 def test_ctrl_c_leaves_nothing(rows):
