@@ -304,13 +304,22 @@ def test_heavy_imports_stand_at_the_top():
     assert not set(LATE) - set(known()), "no such module"
 
 
-def test_lerobots_plug_in_is_light():
-    """Its import loads neither physics nor renderer, so that LeRobot's help and checks do not wait for them."""
+LIGHT = {
+    ("eval.adapters.lerobot_env",): {"warp", "newton", "mujoco", "pxr"},
+    ("policies.protocols.arena_codec", "policies.protocols.handshake"): {"msgpack", "websockets"},
+    ("policies.learned.learned_policy",): {"lerobot", "torchvision", "draccus", "transformers"},
+}
+"""Modules whose import does not load some libraries."""
+
+
+@pytest.mark.parametrize("modules", LIGHT, ids=" and ".join)
+def test_light_modules_stay_light(modules):
+    """LeRobot's help waits for no physics, handshakes need no `[serve]`, and packed policies no LeRobot."""
     found = [
         f"{place(known()[name], statement.lineno)}: {ast.unparse(statement)}"
-        for name in loaded(f"{PACKAGE}.eval.adapters.lerobot_env")
+        for name in loaded(*(f"{PACKAGE}.{module}" for module in modules))
         for statement, late in statements(known()[name].tree)
-        if not late and tops(statement) & {"warp", "newton", "mujoco", "pxr"}
+        if not late and tops(statement) & LIGHT[modules]
     ]
     report(found)
 
