@@ -1,5 +1,6 @@
-"""Engine and device of a run, chosen while it is planned: Warp is loaded only where a GPU is looked for."""
+"""Engine and device of a run, chosen while it is planned: Warp is loaded only where a GPU may be."""
 
+import ctypes
 import itertools
 import os
 from pathlib import Path
@@ -11,6 +12,8 @@ __all__ = ["cluster_engine", "resolve_engine", "visible_gpus"]
 
 NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
+DRIVERS = ("libcuda.so", "libcuda.so.1")
+"""Names by which Warp loads NVIDIA's driver; without it there is no GPU, and Warp need not be asked."""
 
 
 def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
@@ -25,10 +28,12 @@ def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
         return ("warp" if engine == "warp" else "mujoco"), "cpu"
     if device is not None and not device.startswith("cuda"):
         raise InputError(f"--device {device}: unknown, choose cpu, cuda or cuda:N")
-    import warp as wp
+    cuda = False
+    if any(map(_loads, DRIVERS)):
+        import warp as wp
 
-    quiet_warp()
-    cuda = wp.is_cuda_available()
+        quiet_warp()
+        cuda = wp.is_cuda_available()
     if device is not None:
         if not cuda:
             raise InputError(f"--device {device}: no CUDA device on this machine, use --device cpu")
@@ -39,6 +44,14 @@ def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
     if engine == "auto":
         engine = "warp" if cuda else "mujoco"
     return engine, device or ("cuda:0" if cuda else "cpu")
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 def cluster_engine(engine: str, device: str | None, gpus: float | None) -> tuple[str, str]:

@@ -77,8 +77,8 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
     described = [
         dataclasses.asdict(axis) | {"name": axis.name, "grid": values} for axis, values in zip(axes, grid, strict=True)
     ]
-    told = {"interval": wilson(successes, judged), "points": [one.to_json() for one in found]}
-    document = summary_json(FORMAT, options, described, successes=successes, judged=judged, **told)
+    counts = {"interval": wilson(successes, judged), "points": [one.to_json() for one in found]}
+    document = summary_json(FORMAT, options, described, successes=successes, judged=judged, **counts)
     write_atomic(folder / "sensitivity.json", document)
     title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
     save(draw_grid(axes, grid, found, title), folder / "sensitivity.png")

@@ -39,9 +39,9 @@ from arena_newton.eval.play.run_flow import (
     due,
     groups,
     kept,
+    naming_the_command,
     progress_of,
     reported,
-    told_how_to_go_on,
 )
 from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.episode_signals import EpisodeSignals
@@ -185,7 +185,7 @@ def _play(
         folder.sweep()
         run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:
-            with told_how_to_go_on(resume, run.kept):
+            with naming_the_command(resume, run.kept):
                 ended, waiting = begun(config, folder, journal)
                 if waiting:
                     run.play(ended, waiting)

@@ -37,7 +37,7 @@ __all__ = [
     "kept",
     "progress_of",
     "reported",
-    "told_how_to_go_on",
+    "naming_the_command",
 ]
 
 Group = tuple[str, str, str]
@@ -166,7 +166,7 @@ def check_again(
 
 
 @contextlib.contextmanager
-def told_how_to_go_on(resume: str, kept: Callable[[], str]) -> Iterator[None]:
+def naming_the_command(resume: str, kept: Callable[[], str]) -> Iterator[None]:
     """Errors of a block that plays episodes say what is kept, and by which command the run goes on."""
     try:
         yield

@@ -60,8 +60,8 @@ class PointTally:
 
     def to_json(self) -> dict[str, object]:
         """Its numbers and rate, null where they are NaN."""
-        told = dataclasses.asdict(self) | {"success_rate": self.rate}
-        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in told.items()}
+        values = dataclasses.asdict(self) | {"success_rate": self.rate}
+        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
 
     def where(self, axes: Sequence[Axis]) -> str:
         """The placement in words."""

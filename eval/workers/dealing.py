@@ -26,9 +26,9 @@ from arena_newton.eval.play.run_flow import (
     command,
     due,
     kept,
+    naming_the_command,
     progress_of,
     reported,
-    told_how_to_go_on,
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.reports.progress import Progress
@@ -88,7 +88,7 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
         folder.sweep()
         ended.callback(_swept, pool, folder)
         try:
-            with told_how_to_go_on(resume, lambda: kept(config, journal.records)):
+            with naming_the_command(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal)
                 if waiting:
                     _play(DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))

@@ -135,10 +135,10 @@ def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker:
         task: Name.
         tracker: Name; empty: not known.
     """
-    told = [float(name == task) for name in tasks]
+    vector = [float(name == task) for name in tasks]
     if trackers:
-        told += [float(name == tracker) for name in trackers] + [float(tracker not in trackers)]
-    return told
+        vector += [float(name == tracker) for name in trackers] + [float(tracker not in trackers)]
+    return vector
 
 
 def checkpoint_folder(path: Path, flag: str = "--policy lerobot") -> Path:

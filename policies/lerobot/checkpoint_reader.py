@@ -291,8 +291,8 @@ def _features(
             continue  # the network fills it with an empty picture itself
         if given == TASK_VECTOR:
             trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
-            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
-            raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
+            message = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
+            raise InputError(f"{path}: input {name} is {_shape(feature)}, but {message}")
         known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
     for name in (STATE, *((TASK_VECTOR,) if facts.task_vector else ())):

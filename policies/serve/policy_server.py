@@ -525,8 +525,8 @@ class PolicyServer:
     def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:
         mask = np.zeros(self.max_sessions, dtype=bool)
         mask[list(rows)] = True
-        said = task.name, task.gym_id, task.instruction, self.tracker
-        return Observation(self._state, self._image, mask, *said)
+        described = task.name, task.gym_id, task.instruction, self.tracker
+        return Observation(self._state, self._image, mask, *described)
 
     def _act(self, task: _Task, asking: Sequence[tuple[_Job, _Session]]) -> None:
         """One call of the policy."""

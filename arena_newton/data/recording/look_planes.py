@@ -101,16 +101,16 @@ class LookPlanes:
 
     def begin(self, world: int, episode_seed: int) -> Looks:
         """Draw the second lights of a world's episode."""
-        told: list[tuple[float, ...]] = []
+        rows: list[tuple[float, ...]] = []
         for number, lights in enumerate(self._lights):
             light = second_light(episode_seed, number)
             if isinstance(light, LightDraw):
                 lights.set(world, light)
-                told.append((light.intensity, *light.direction))
+                rows.append((light.intensity, *light.direction))
             else:
                 lights.set(world, None, dome_intensity=light)
-                told.append((light,))
-        return Looks(STRIDE, tuple(told), self._shapes)
+                rows.append((light,))
+        return Looks(STRIDE, tuple(rows), self._shapes)
 
     def frames(self, worlds: Sequence[int]) -> torch.Tensor:
         """Frames of worlds whose pictures the camera has just rendered, uint8, shape [len(worlds), H, W, 3]."""

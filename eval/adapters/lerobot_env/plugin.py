@@ -142,8 +142,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
         }
         if worlds.task_vector:
-            told = len(worlds.task_vector) + (len(worlds.tracker_vector) + 1 if worlds.tracker_vector else 0)
-            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (told,))
+            width = len(worlds.task_vector) + (len(worlds.tracker_vector) + 1 if worlds.tracker_vector else 0)
+            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (width,))
         self.features_map = {key: key for key in self.features}
 
     @property

@@ -198,14 +198,14 @@ def _check(clip: ClipShape, recipe: TrainingRecipe, folder: Path) -> None:
 
 def _whole(kind: type[PreTrainedModel], folder: Path) -> torch.nn.Module:
     """A part of CLIP all of whose weights are in the folder; transformers would draw those that are missing."""
-    said_before = transformers_logging.get_verbosity()
+    verbosity = transformers_logging.get_verbosity()
     transformers_logging.set_verbosity_error()  # it would warn about the half of CLIP that the other encoder takes
     try:
         loaded: object = kind.from_pretrained(folder, local_files_only=True, output_loading_info=True)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: holds no weights of CLIP ({str(error).splitlines()[0]})") from None
     finally:
-        transformers_logging.set_verbosity(said_before)
+        transformers_logging.set_verbosity(verbosity)
     assert isinstance(loaded, tuple)
     model, text = loaded
     missing = sorted({*text["missing_keys"], *(one[0] for one in text.get("mismatched_keys", ()))})

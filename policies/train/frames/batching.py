@@ -122,8 +122,8 @@ class BatchMaker:
         """Make the constants."""
         device = self.store.device
         self._offsets = torch.tensor(list(self.offsets), device=device)
-        told = [[(task, tracker), (task, "")] for task, tracker in self.store.pairs]
-        vectors = [[vector_of(self.task_vector, self.tracker_vector, *one) for one in both] for both in told]
+        pairs = [[(task, tracker), (task, "")] for task, tracker in self.store.pairs]
+        vectors = [[vector_of(self.task_vector, self.tracker_vector, *one) for one in both] for both in pairs]
         self._vectors = torch.tensor(vectors, device=device)
         """Vector of each pair, and that of its task with an unknown tracker, shape [pairs, 2, width]."""
 
