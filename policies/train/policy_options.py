@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +24,7 @@ __all__ = [
     "check_numbers",
     "check_ranges",
     "check_teachable",
+    "look_fractions",
     "task_weights",
 ]
 
@@ -68,6 +69,9 @@ class PolicyTrainOptions:
     """Weights of tasks in the draw of --balance task, as boxing=1.5 double_desk=2; 1 of those that are not named."""
     picture_every: int = field(default=1, metadata=bounds(1, 1000))
     """Ticks from one picture of an episode that is loaded, and that a sample begins at, to the next."""
+    looks: Several[str] = ()
+    """Fraction of the samples whose looks are changed, and that of single tasks, as 0.6 double_desk=0.3; of datasets
+    that were recorded with `eval record --looks`."""
     task_vector: bool = False
     """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
     tracker_vector: bool = True
@@ -175,15 +179,34 @@ def task_weights(given: Sequence[str]) -> dict[str, float]:
     Raises:
         InputError: One is no name and positive number.
     """
+    expected = "a task and a positive number, as boxing=1.5"
+    return _task_numbers("--task-weights", given, expected, lambda task, number: bool(task) and 0.0 < number < math.inf)
+
+
+def look_fractions(given: Sequence[str]) -> tuple[float, dict[str, float]]:
+    """Fraction of the samples whose looks are changed, and that of single tasks, as they are typed.
+
+    Raises:
+        InputError: One is no fraction.
+    """
+    expected = "a fraction from 0 to 1, of one task as double_desk=0.3"
+    found = _task_numbers("--looks", given, expected, lambda _, number: 0.0 <= number <= 1.0)
+    return found.pop("", 0.0), found
+
+
+def _task_numbers(
+    flag: str, given: Sequence[str], expected: str, fits: Callable[[str, float], bool]
+) -> dict[str, float]:
+    """Numbers of tasks, typed as task=number; one without a task has none."""
     found: dict[str, float] = {}
     for text in given:
-        task, _, number = text.partition("=")
+        task, _, number = text.rpartition("=")
         try:
             found[task] = float(number)
         except ValueError:
             found[task] = math.nan
-        if not task or not 0.0 < found[task] < math.inf:
-            raise InputError(f"--task-weights {text}: expected a task and a positive number, as boxing=1.5")
+        if not fits(task, found[task]):
+            raise InputError(f"{flag} {text}: expected {expected}")
     return found
 
 
@@ -221,6 +244,7 @@ def check_numbers(options: PolicyTrainOptions) -> None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.labels not in ("", "v3.1", "v4"):
         raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    look_fractions(options.looks)
     if options.balance not in BALANCES:
         raise InputError(f"--balance {options.balance}: unknown, choose from {', '.join(BALANCES)}")
     if task_weights(options.task_weights) and options.balance != "task":

@@ -182,6 +182,7 @@ class PolicyTrainer:
         recipe = self.recipe
         batch = self.batches(
             self._rows,
+            looks=True,
             shift=recipe.shift_px,
             colour=recipe.colour,
             transforms=recipe.image_transforms,

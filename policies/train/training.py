@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,9 +24,10 @@ from arena_newton.policies.train.families.policy_model import TrainableModel
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, task_weights
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_fractions, task_weights
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
@@ -80,9 +82,9 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
         with _group(device, processes), fast_kernels(device):
             return _train(options, settings, out, device, processes, progress, checkpoint)
     except torch.OutOfMemoryError as error:
-        told = " ".join(str(error).split())[:160]
+        text = " ".join(str(error).split())[:160]
         raise ArenaError(
-            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+            f"{device}: its memory is full ({text}); try a smaller --batch-size, or fewer datasets"
         ) from None
 
 
@@ -114,6 +116,9 @@ def _train(
         store = load_frames(
             datasets, device, hold_out=options.hold_out, every=every, jobs=jobs, network=network, on_frames=bar.update
         )
+    if options.looks:
+        looks = load_looks(datasets, store, *look_fractions(options.looks), jobs=jobs, network=network)
+        store = dataclasses.replace(store, looks=looks)
     if speaks:
         size = store.pictures.numel() / 1e9
         print(
@@ -253,7 +258,7 @@ def pair_weights(store: FrameStore, options: PolicyTrainOptions) -> list[float] 
     return [weights.get(task, 1.0) for task, _ in store.pairs]
 
 
-def camera_fit(store: FrameStore) -> str:
+def camera_fit(store: FrameStore) -> Literal["pad", "native"]:
     """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
     band = (store.height - store.width * 3 // 4) // 2
     return "pad" if band > 0 and min(store.top, store.bottom) >= BLACK_PART * band else "native"

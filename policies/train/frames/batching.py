@@ -141,6 +141,7 @@ class BatchMaker:
         self,
         rows: torch.Tensor,
         *,
+        looks: bool = False,
         shift: int = 0,
         colour: float = 0.0,
         transforms: bool = False,
@@ -152,6 +153,7 @@ class BatchMaker:
 
         Args:
             rows: int64, shape [B].
+            looks: Change the looks of a part of the samples, which may then begin a few rows earlier.
             shift: Most pixels by which a picture is shifted.
             colour: Most relative change of brightness and colours.
             transforms: Apply LeRobot's image transforms.
@@ -161,12 +163,14 @@ class BatchMaker:
             `observation.images.front` [B, 3, H, W], `observation.state` [B, 64], `action` [B, n, 40], `action_is_pad`
             bool [B, n]; the task vector and tokens of language where the policy takes them.
         """
-        store = self.store
+        store, changed = self.store, None
+        if looks and store.looks is not None:
+            rows, changed = store.looks.chosen(rows)
         wanted = rows[:, None] + self._offsets
         inside = torch.minimum(torch.maximum(wanted, store.first[rows][:, None]), store.last[rows][:, None])
         batch = {
             CAMERA_KEY: gathered_pictures(
-                store, rows, tall=self.tall, shift=shift, colour=colour, transforms=transforms
+                store, rows, changed=changed, tall=self.tall, shift=shift, colour=colour, transforms=transforms
             ),
             STATE_KEY: store.states[rows],
             ACTION_KEY: store.actions[inside],

@@ -12,8 +12,10 @@ import numpy as np
 
 from arena_newton.data.datasets.row_statistics import aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import DatasetFiles, read_json
-from arena_newton.data.readers.label_protocols import LABELS, action_names, decode_v4, encode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
+from arena_newton.data.readers.label_protocols import LABELS, action_names, encode_v4
 from arena_newton.data.readers.lerobot_reader import DatasetActions
+from arena_newton.data.readers.looks import LOOKS_FOLDER
 from arena_newton.errors import InputError
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
@@ -151,7 +153,7 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
 
 
 def content_hash(files: DatasetFiles, states: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> str:
-    """SHA-256 over `meta/info.json`, `meta/stats.json` (of the pictures too) and every number of states and actions.
+    """SHA-256 over `meta/info.json`, `meta/stats.json` (of pictures too), the list of looks, states and actions.
 
     `info.json` of the original's datasets says no more than how many episodes and rows there are.
     """
@@ -159,6 +161,9 @@ def content_hash(files: DatasetFiles, states: Sequence[np.ndarray], actions: Seq
     statistics_file = files.root / "meta" / "stats.json"
     if statistics_file.is_file():
         digest.update(statistics_file.read_bytes())
+    looks = files.root / LOOKS_FOLDER / "looks.json"
+    if looks.is_file():
+        digest.update(looks.read_bytes())
     for numbers in (*states, *actions):
         digest.update(np.ascontiguousarray(numbers).tobytes())
     return digest.hexdigest()

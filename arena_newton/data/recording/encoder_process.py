@@ -1,4 +1,4 @@
-"""``python -m arena_newton.data.recording.film_process``: a process that encodes films for a recorder.
+"""``python -m arena_newton.data.recording.encoder_process``: a process that encodes films for a recorder.
 
 The recorder writes pictures into memory that both map and says over a socket which film each belongs to. The process
 answers when it has read the pictures of a message, when a film is finished, and when one could not be written. It ends
@@ -118,8 +118,14 @@ class _Films:
         match message:
             case {"memory": memories}:
                 self._memories = [SlotMemory(*numbers) for numbers in cast("list[list[int]]", memories)]
-            case {"film": int(number), "video": str(video), "depth": str(depth), "fps": float(fps)}:
-                self._films[number] = Film(Path(video), Path(depth), fps)
+            case {
+                "film": int(number),
+                "video": str(video),
+                "depth": str(depth),
+                "fps": float(fps),
+                "lossless": bool(exact),
+            }:
+                self._films[number] = Film(Path(video), Path(depth), fps, exact)
             case {"camera": int(camera), "slot": int(slot), "rows": rows}:
                 memory = self._memories[camera]
                 pictures, depths = memory.pictures[slot], memory.depths
