@@ -102,7 +102,7 @@ def palette(device: torch.device) -> torch.Tensor:
     """All colours that shapes may get, sRGB from 0 to 1, float32, shape [4096, 3]."""
     rng = np.random.default_rng(0)
     hue, grey, saturation, value = rng.random((4, 4 * COLOURS))
-    saturation = np.where(grey < 0.35, 0.25 * saturation, 0.2 + 0.75 * saturation)
+    saturation = np.where(grey < 0.5, 0.25 * saturation, 0.2 + 0.75 * saturation)
     value = 0.06 + 0.88 * value
     offsets = (hue[:, None] * 6.0 + np.array([5.0, 3.0, 1.0])) % 6.0
     drawn = value[:, None] * (1.0 - saturation[:, None] * np.clip(np.minimum(offsets, 4.0 - offsets), 0.0, 1.0))

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.errors import InputError
 
 __all__ = ["FIRST_SHAPE", "LOOKS_FOLDER", "MOST_LIGHTS", "MOST_SHAPES", "SCHEMA", "DatasetLooks", "Looks"]
@@ -134,6 +133,8 @@ def dataset_looks(root: Path, episodes: int) -> list[DatasetLooks | None]:
     Raises:
         InputError: The list is damaged, of another version or of other episodes, or a film is missing.
     """
+    from arena_newton.data.readers.dataset_files import read_json  # which needs the extra [data]
+
     path = root / LOOKS_FOLDER / "looks.json"
     if not path.parent.is_dir():
         return [None] * episodes
