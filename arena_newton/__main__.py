@@ -42,7 +42,7 @@ COMMANDS = (
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
     Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; teachable"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
-    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
+    Command("scenes", "arena_newton.usd_scenes.__main__", "validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers check", "arena_newton.trackers.tracker_check", "try what the interface promises on a tracker"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),

@@ -237,7 +237,7 @@ def _scenes() -> list[Finding]:
     findings = []
     for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in tasks.names())):
         if not (root / name).is_file():
-            advice = "run `python -m arena_newton.usd_scenes build`"
+            advice = "install again, or run `python -m scene_builders` in a checkout"
             findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
     return findings or [Finding("scenes", f"robot and all tasks in {root}")]
 

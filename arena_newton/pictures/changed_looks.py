@@ -123,7 +123,8 @@ def changed_looks(
 
     Args:
         seen: Pictures, uint8, shape [B, H, W, 3].
-        frames: Their looks, a shape and two light ratios per pixel, uint8, shape [B, H, W, 3] (`data.readers.looks`).
+        frames: Their looks, a shape and one or two light ratios per pixel, uint8, shape [B, H, W, 2 or 3]
+            (`data.readers.looks`).
         chances: Probability of another colour of each shape, float32, shape [B, 256].
         objects: First shape of the object that each shape is part of, int64, shape [B, 256].
         task: Number of each sample's task, int64, shape [B]; things are cut out of another task's pictures.
@@ -144,7 +145,7 @@ def changed_looks(
     pixels = _with_things(pixels, luma, owner, chance, free, task, (height, width), changes.things)
     inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
     pixels = torch.where(inside[..., None], _colours((batch, 1), device), pixels)
-    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., 2]).float()
+    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., -1]).float()
     ratio = torch.exp2((lit.reshape(batch, -1) - 128.0) / 32.0)
     weight = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.light, device)
     pixels = pixels * (1.0 + weight * (ratio - 1.0))[..., None]

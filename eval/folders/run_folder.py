@@ -63,9 +63,13 @@ def results_folder(out: str | None, shard: Shard | None = None) -> Path:
     return Path(out).expanduser()
 
 
+FORMER_FLAGS = ("seeing",)
+"""Flags of earlier versions that change nothing any more."""
+
+
 def stored_options(folder: Path) -> RunOptions:
     """The flags that a results folder was made with, to be resumed."""
-    stored = read_document(folder)["options"]
+    stored = {name: value for name, value in read_document(folder)["options"].items() if name not in FORMER_FLAGS}
     where = f"{folder / CONFIG_FILE}: options"
     return dataclasses.replace(RunOptions(**check_types(where, stored, RunOptions)), out=str(folder))
 

@@ -324,7 +324,6 @@ def resolve(options: RunOptions) -> RunConfig:
         repeats=repeats,
         max=(options.max or MOST_EPISODES) if options.until_width is not None else None,
         strip=options.strip or quick,
-        seeing=options.seeing or (quick and options.policy == "expert" and not options.record),
         follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,

@@ -85,7 +85,7 @@ def _check_shard(options: RunOptions) -> None:
     if options.shard is None:
         return
     parse_shard(options.shard)
-    if is_quick(options) or options.seeing:
+    if is_quick(options):
         raise InputError(
             "--shard: splits a plan, which --task, --seeds or --repeats name; --task all is the benchmark's"
         )

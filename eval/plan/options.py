@@ -145,7 +145,7 @@ class Recording:
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
     record_looks: int = 0
-    """Write what every fifth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
+    """Write what every fourth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
 
 
 @dataclass(frozen=True)
@@ -267,8 +267,6 @@ class RunOptions(
     Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
-    seeing: Annotated[bool, tyro.conf.Suppress] = False
-    """Also play a few episodes of the policy that comes with the package (the default run)."""
     series: Annotated[int | None, tyro.conf.Suppress] = None
     """Series of demonstrations whose seeds are played instead of the evaluation's (`eval record`)."""
     keep: Annotated[int | None, tyro.conf.Suppress] = None
@@ -306,7 +304,7 @@ class _Demonstrations:
     depth: bool = False
     """Write the depth of each picture too, float16 [m]."""
     looks: int = 0
-    """Write what every fifth picture shows and its light under so many second lights, 1 or 2, so that a training can
+    """Write what every fourth picture shows and its light under so many second lights, 1 or 2, so that a training can
     change its looks (docs/recording.md)."""
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
 
+from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
 from arena_newton.eval.plan.episode_plan import Episode
@@ -26,7 +27,7 @@ from arena_newton.eval.play.run_flow import (
     due,
     kept,
     progress_of,
-    run_and_report,
+    reported,
     told_how_to_go_on,
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
@@ -52,13 +53,12 @@ GIVEN_UP = 5
 """So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
 
 
-def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
-    """Run or continue the run of a folder that was checked, and that of a folder inside, by other processes.
+def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
+    """Run or continue the run of a folder that was checked by other processes.
 
     Args:
         folder: Of the run; its flags say which processes.
         factories: What the processes build the run with, importable there; the real parts by default.
-        beside: Of the run inside.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -69,7 +69,10 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         RunStopped: Simulator, tracker, policy or cluster broke down as a whole; finished episodes are kept.
     """
     with backend_of(folder.config.flags, folder.config.device) as backend:
-        return run_and_report(folder, beside, lambda one: _played(backend, one, factories))
+        began = time.perf_counter()
+        if not _played(backend, folder, factories):
+            return INTERRUPTED
+        return reported(folder, time.perf_counter() - began)
 
 
 def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | None) -> bool:

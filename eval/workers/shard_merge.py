@@ -283,7 +283,7 @@ def _document(runs: Sequence[RunRecord], out: Path, *, whole: bool) -> Document:
     """config.json of all: the first folder's, with the environments and versions of the others."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
-    document["options"] = runs[0].document["options"] | {"shard": None, "seeing": False, "out": str(out)}
+    document["options"] = runs[0].document["options"] | {"shard": None, "out": str(out)}
     environments: dict[str, JsonObject] = {}
     for run in runs:
         environments = run.document.get("environments", {}) | environments

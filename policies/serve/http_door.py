@@ -331,6 +331,8 @@ class HttpDoor:
 
     def close(self) -> None:
         """End the door and its connections."""
+        with suppress(OSError):  # which wakes who waits for a connection
+            self._listener.socket.shutdown(socket.SHUT_RDWR)
         self._listener.shutdown()
         self._listener.hang_up()
         self._listener.server_close()

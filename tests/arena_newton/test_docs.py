@@ -1,4 +1,4 @@
-"""What the documentation shows runs, and what it names exists."""
+"""The documentation's examples run, and the names in it exist."""
 
 import re
 from pathlib import Path

@@ -379,7 +379,7 @@ class Dated(Policy):
 
 
 def test_a_policy_reads_the_world_and_writes_nothing(env):
-    """What `attach` gives shows positions of this tick; writing is an error, or moves nothing."""
+    """The view that `attach` gives shows positions of this tick; writing is an error, or moves nothing."""
     seen = []
 
     class Meddling(Sway):

@@ -1,4 +1,4 @@
-"""How chunks are executed: --latency-ticks, --replan, --ensemble, and the protocol that a policy says of itself."""
+"""Execution of chunks: --latency-ticks, --replan, --ensemble, and the protocol that a policy says of itself."""
 
 import dataclasses
 import json

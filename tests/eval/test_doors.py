@@ -41,7 +41,7 @@ def checkpoint(tmp_path_factory):
 
 
 def play(door, *episodes, seconds=1.0):
-    """What a door did: episodes as outcome and actions."""
+    """Episodes of a door, as outcome and actions."""
     made = [
         DoorEpisode(f"s0/r{number}", outcome, outcome, len(actions), 0.5, np.asarray(actions, np.float32))
         for number, (outcome, actions) in enumerate(episodes)
@@ -225,7 +225,7 @@ def test_lerobot_eval_plays_a_policy_with_a_task_vector(checkpoint, monkeypatch,
 
 
 def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_path):
-    """What LeRobot records of a policy with a task vector has it as a column."""
+    """LeRobot's recording of a policy with a task vector has it as a column."""
     flags = ["--eval.n_episodes=1", "--eval.batch_size=1", "--seed=0", "--env.episode_length=3"]
     argv(monkeypatch, checkpoint, *flags, f"--output_dir={tmp_path / 'out'}", "--eval.recording=true")
     eval_main()

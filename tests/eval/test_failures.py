@@ -107,7 +107,7 @@ def test_only_failures_with_signals_have_a_stage():
 
 
 def test_a_touch_is_one_that_the_journal_knows():
-    """Where the task has a predicate of the touch, an episode without it has touched nothing; unknown, signals say."""
+    """In a task with a predicate of the touch an episode without it has touched nothing; unknown, signals say."""
     touched = {"task": "pp_box", "aligned_ticks": 300}
     assert stage_of(judged(**touched, predicates={"approach": 40, "contact": 300})) == "contact"
     assert stage_of(judged(**touched, predicates={"approach": 40, "contact": None})) == "posture"
@@ -551,7 +551,7 @@ def test_a_misled_expert_sits_down_nowhere_or_without_weight(sofa):
 
 
 def test_saboteurs_play_more_episodes_than_worlds():
-    """What a saboteur changed in a world's episode is forgotten in its next one."""
+    """Changes of a saboteur in a world's episode are forgotten in its next one."""
     env = ArenaEnv("boxing", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
     planned = [SimpleNamespace(index=n, episode_seed=seed) for n, seed in enumerate(SEEDS)]
     expert = SABOTAGES["misaimed"].body.equip(Factories()).policy("expert")

@@ -99,7 +99,7 @@ def test_what_it_returns_is_in_its_spaces(make):
 
 
 def test_an_observation_is_the_callers(make):
-    """What was returned does not change with later steps."""
+    """A returned observation does not change with later steps."""
     env = make(image_size=(40, 32), settle="reset")
     first, _ = env.reset(seed=0)
     kept = {name: first[name].copy() for name in ("agent_pos", "pixels")}

@@ -1,4 +1,4 @@
-"""What the driver of `run --ray` does with what processes tell: nothing is lost, nothing counts twice."""
+"""The driver of `run --ray` and the messages of processes: nothing is lost, nothing counts twice."""
 
 from types import SimpleNamespace
 
@@ -83,7 +83,7 @@ def driven(tmp_path):
 
 
 def outcomes(records):
-    """What came of each episode, by number; each is there once."""
+    """Ends of the episodes, by number; each is there once."""
     assert len({record.index for record in records}) == len(records)
     return {record.index: (record.outcome, record.steps, record.margin) for record in records}
 
@@ -127,7 +127,7 @@ def test_what_ended_before_a_loss_is_not_played_again(driven):
 
 
 def test_a_poison_episode_ends_as_an_error_and_the_rest_goes_on(driven):
-    """Who is running at a loss comes into a smaller slice, then alone; after the attempts alone it is an error."""
+    """Episodes that run at a loss come into a smaller slice, then alone; after the attempts alone one is an error."""
     undisturbed, _, _ = driven(out="u")
 
     def lost(assignment, told):
@@ -161,7 +161,7 @@ def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):
 
 
 def test_a_lost_machine_blames_no_episode(driven):
-    """When a machine leaves the cluster, what ran there is not suspected."""
+    """Episodes of a machine that left the cluster are not suspected."""
     count = iter(range(100))
     records, pool, _ = driven(
         lambda assignment, told: (1, Lost("gone", with_node=True)) if next(count) < 12 else None,

@@ -37,7 +37,7 @@ class Answer:
 
 
 class InlineRay:
-    """What the pool uses of Ray; `dies` is asked before each answer."""
+    """The part of Ray that the pool uses; `dies` is asked before each answer."""
 
     def __init__(self, dies=lambda: False, cores=2.0):
         self.dies, self.opened, self.actors, self.killed = dies, [], 0, 0

@@ -67,7 +67,7 @@ def contents(folder):
 
 
 def same(folder, other):
-    """Whether two folders hold the same episodes, byte for byte; the names that differ are shown."""
+    """Asserts that two folders hold the same episodes, byte for byte; the names that differ are shown."""
     mine, others = contents(folder), contents(other)
     assert sorted(mine) == sorted(others)
     assert [name for name in mine if mine[name] != others[name]] == []
@@ -260,7 +260,7 @@ def test_only_successes_are_kept_in_rounds(brief, tmp_path, parts, capsys):
 
 
 def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, parts, monkeypatch):
-    """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
+    """If the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
     renders = []
     render = Camera.render
     monkeypatch.setattr(Camera, "render", lambda self, *a: renders.append(1) or render(self, *a))

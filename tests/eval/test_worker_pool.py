@@ -1,4 +1,4 @@
-"""How processes of a cluster are asked for, held to their deadline and replaced; a stand-in for Ray answers."""
+"""Processes of a cluster are asked for, held to their deadline and replaced; a stand-in for Ray answers."""
 
 import dataclasses
 import os
@@ -59,7 +59,7 @@ class Method:
 
 
 class FakeRay:
-    """What the pool uses of Ray; a test says what actors answer."""
+    """The part of Ray that the pool uses; a test says what actors answer."""
 
     def __init__(self, opened, nodes):
         self.node_list, self.opened, self.asked, self.killed = nodes, opened, [], []
@@ -141,7 +141,7 @@ def assignment(pool, config):
 
 
 def messages(pool, rounds=6):
-    """What comes in so many rounds."""
+    """Messages of so many rounds."""
     return [message for _ in range(rounds) for _, _, message in pool.messages()]
 
 

@@ -1,4 +1,4 @@
-"""What docs/policies.md says is so: its tables, its server, its policy in Python."""
+"""Statements of docs/policies.md hold: its tables, its server, its policy in Python."""
 
 import json
 import re

@@ -77,7 +77,7 @@ def test_bytes_are_those_of_threads_and_of_neither(tmp_path):
 
 
 def test_dropped_films_leave_no_file(tmp_path):
-    """What is dropped in the middle is gone, and the pool takes other pictures afterwards."""
+    """Films dropped in the middle are gone, and the pool takes other pictures afterwards."""
     pool = FilmPool(2, 1)
     reels = begin(pool, tmp_path)
     pool.add("front", reels, *pictures(0))

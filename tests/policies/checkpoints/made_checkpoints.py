@@ -130,12 +130,12 @@ def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.0
 
 
 def facts(**changes):
-    """What a checkpoint of ours says, with tiny pictures."""
+    """Facts of a checkpoint of ours, with tiny pictures."""
     return CheckpointFacts(**{"width": SIDE, "height": SIDE} | changes)
 
 
 def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="twist2"):
-    """What worlds show: it follows from each world's seed and tick alone."""
+    """Observation of worlds, which follows from each world's seed and tick alone."""
     state, pictures = [], []
     for key in zip(seeds, ticks, strict=True):
         rng = np.random.default_rng(key)

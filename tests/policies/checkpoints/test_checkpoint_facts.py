@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself is read back, and damage is one clear error."""
+"""Facts of a checkpoint are read back, and damage is one clear error."""
 
 import json
 import random

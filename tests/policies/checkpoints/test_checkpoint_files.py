@@ -34,7 +34,7 @@ TRANSFORMS = {
         "pad": {"weight": 1.0, "type": "Pad", "kwargs": {"padding": [0, 8, 0, 8], "fill": 0}},
     },
 }
-"""What the original's training does to 640x480 pictures, at a size for tests."""
+"""Preparation of 640x480 pictures in the original's training, at a size for tests."""
 
 
 @pytest.fixture

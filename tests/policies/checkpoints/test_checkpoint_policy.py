@@ -79,7 +79,7 @@ def test_an_answer_is_what_lerobot_computes(made, checkpoints):
 
 @pytest.mark.parametrize("family", ["diffusion", "flow"])
 def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
-    """Where the global generator is set as an episode's, LeRobot's own sampling gives the same actions."""
+    """LeRobot's own sampling gives the same actions once the global generator is set as an episode's."""
     from arena_newton.policies.lerobot import checkpoint_network
     from arena_newton.policies.lerobot.network_noise import Draw, generators
 

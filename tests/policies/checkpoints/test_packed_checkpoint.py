@@ -241,7 +241,7 @@ def test_a_foreign_folder_is_not_overwritten(trained, tmp_path):
 
 @pytest.mark.parametrize("fault", ["disk", "folder"])
 def test_a_policy_that_cannot_be_replaced_is_kept(packed, tmp_path, monkeypatch, fault):
-    """Where the new files cannot be written, the packed policy that is there answers as before."""
+    """A packed policy that cannot be replaced answers as before."""
     folder = copy(packed, tmp_path)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -278,7 +278,7 @@ def test_a_policy_that_cannot_be_replaced_is_kept(packed, tmp_path, monkeypatch,
     ],
 )
 def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp_path, changes, said):
-    """Whatever our forward pass does not compute is one error that names file and field."""
+    """A setting that our forward pass does not compute is one error that names file and field."""
     folder = copy(packed, tmp_path)
     edit(folder / "config.json", **changes)
     with pytest.raises(InputError, match=said) as error:
@@ -296,7 +296,7 @@ def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp
     ],
 )
 def test_processors_that_would_compute_otherwise_are_refused(packed, tmp_path, index, changes, said):
-    """What LeRobot's processors would do otherwise with the same files is one error that names file and step."""
+    """A step that LeRobot's processors would compute otherwise is one error that names file and step."""
     folder = copy(packed, tmp_path)
     path = folder / "policy_preprocessor.json"
     content = json.loads(path.read_text())
@@ -404,7 +404,7 @@ def test_damaged_files_are_one_error(packed, tmp_path):
     ],
 )
 def test_a_card_of_another_policy_is_refused(packed, tmp_path, field, value, said):
-    """What the card repeats of the files next to it is compared with them; the message names card and field."""
+    """Facts that the card repeats of the files next to it are compared with them; the message names card and field."""
     folder = copy(packed, tmp_path)
     edit(folder / CARD_FILE, **{field: value})
     with pytest.raises(InputError, match=f"card.json: {field} is {said}.*; take all files of one policy"):

@@ -37,7 +37,7 @@ TRACEBACK = (
 
 
 def facts(**other):
-    """What a server of ours declares."""
+    """Declaration of a server of ours."""
     names = tuple(action_names(other.get("labels", "v3.1")))
     said = {
         "policy": "noise 1",
@@ -102,7 +102,7 @@ def observation(worlds, mask=None, size=SIZE):
 
 
 class Recorder:
-    """What a server keeps of its life, and how it is told to fail."""
+    """Memory of a server, and the faults that it is told to have."""
 
     def __init__(self):
         self.lock, self.release = threading.Lock(), threading.Event()
@@ -279,7 +279,7 @@ MODALITIES = {
     "action": {"delta_indices": list(range(CHUNK)), "modality_keys": list(ACTION)},
     "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
 }
-"""What a GR00T server that was trained on our data says of itself."""
+"""Declaration of a GR00T server that was trained on our data."""
 
 
 def npy(array):

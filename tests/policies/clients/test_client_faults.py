@@ -203,7 +203,7 @@ def test_another_policy_after_a_restart():
 
 
 def test_a_server_that_greets_with_garbage_is_there():
-    """Whether somebody listens is no question of what he says: garbage is an answer, silence and a closed port none."""
+    """Garbage is an answer of a server that is there; silence and a closed port are none."""
     server = SocketServer("openpi", metadata=b"\xc1\xff")
     link = policies.get(f"remote:{server.url}")._connect()
     assert link.alive(10.0)

@@ -29,7 +29,7 @@ def broken(good, count, seed):
 
 
 def hand_made():
-    """What no random damage finds: other types in every place of an answer."""
+    """Damage that no random bytes find: other types in every place of an answer."""
     odd = [None, True, 7, -1.5, "text", b"bytes", [], {}, [[1.0] * 40], [[1] * 40, None], {"actions": 3}]
     odd += [np.zeros((0, 40)), np.zeros((40, 40, 40)), np.full((2, 40), np.inf), np.zeros((2, 40), bool)]
     odd += [np.zeros((3, 40), np.int64), np.zeros(40, np.float16), np.zeros((1, 0), np.float32)]

@@ -109,7 +109,7 @@ def test_another_server_under_the_same_address(tmp_path, capsys):
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "gr00t"])
 def test_server_that_declares_nothing_is_said_once(tmp_path, capsys, protocol):
-    """What is assumed is one line on stderr and part of the configuration; the number of worlds then counts."""
+    """An assumption is one line on stderr and part of the configuration; the number of worlds then counts."""
     server = Gr00tServer() if protocol == "gr00t" else SocketServer(protocol, metadata={})
     flags = [*SHORT, "--worlds", "2", "--policy", f"remote:{server.url}", "--out", str(tmp_path / "o")]
     assert main(flags, parts()) == 0

@@ -1,4 +1,4 @@
-"""What servers declare is compared before the first episode; what they do not declare is tried, assumed and said."""
+"""Declarations of servers are compared before the first episode; absent ones are tried, assumed and said."""
 
 import copy
 import http.client
@@ -64,7 +64,7 @@ def test_what_differs_is_refused(protocol, other, text):
 
 @pytest.mark.parametrize("protocol", ["http", "openpi", "vla-eval", "gr00t"])
 def test_a_server_that_repeats_the_token(protocol, monkeypatch):
-    """What a server declares holds no token in results or messages, also where it repeats what it was sent."""
+    """Declarations hold no token in results or messages, also of a server that repeats what it was sent."""
     monkeypatch.setenv("ARENA_POLICY_TOKEN", "se-cret")
     server = server_of(protocol, facts(facts={"a": [{"b se-cret": "Bearer se-cret"}]}, policy="se-cret"))
     told = json.dumps(checked(server).describe())

@@ -1,4 +1,4 @@
-"""What docs/serving.md says of clients is so: protocols, ports, keys and limits."""
+"""Statements of docs/serving.md about clients hold: protocols, ports, keys and limits."""
 
 import re
 from pathlib import Path

@@ -108,7 +108,7 @@ class Served:
     """A policy behind a protocol at a free port."""
 
     def __init__(self, policy, protocol="openpi", token="", connections=None, tls=None, raw=False, **options):
-        options = {"max_sessions": 8, "max_wait": 0.05} | options
+        options = {"max_sessions": 8, "max_wait": 0.002} | options
         self.policy = policy
         self.server = PolicyServer(policy, **options)
         self.server.start()
@@ -139,7 +139,7 @@ class Served:
 
 
 def together(*works):
-    """What several functions return that run at the same time."""
+    """Results of several functions that run at the same time."""
     results = [None] * len(works)
 
     def run(index):

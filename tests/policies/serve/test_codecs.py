@@ -344,21 +344,21 @@ def _front(**more):
     ],
 )
 def test_unfit_requests(work, message):
-    """What is wrong with a request is named, in one line."""
+    """An unfit request is one line that names the fault."""
     with pytest.raises(WireError, match=message) as caught:
         work()
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 
 def test_a_traceback_is_one_line():
-    """What another server sends as text is shown as its last line, cleared of control characters."""
+    """Text of another server is shown as its last line, cleared of control characters."""
     text = "Traceback (most recent call last):\n  File x\nKeyError: \x1b[31m'observation/joint_position'\n"
     with pytest.raises(WireError, match="^server: the server says KeyError: 'observation/joint_position'$"):
         openpi_codec.unpack_answer(text, "server")
 
 
 def test_handshake_comes_back():
-    """What is declared is the same behind every protocol, also where little is."""
+    """Declared facts are the same behind every protocol, also where they are few."""
     few = ServedFacts(picture=ServedPicture(64, 48, "native"), chunk_length=20, realign=0.002, facts={"family": "act"})
     for facts in (expected_facts("v4"), ServedFacts(), few):
         assert openpi_codec.unpack_metadata(openpi_codec.pack_metadata(facts), "s")[0] == facts

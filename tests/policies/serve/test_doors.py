@@ -459,7 +459,7 @@ def test_a_slow_client_holds_up_nobody(served):
     ],
 )
 def test_unfit_http(served, head, status):
-    """What is not a request of the protocol is refused as JSON, without pages or tracebacks, and the server goes on."""
+    """Other requests than the protocol's are refused as JSON, without pages or tracebacks, and the server goes on."""
     one = served(Remembers(), "arena")
     with socket.create_connection(("127.0.0.1", one.port), timeout=10) as connection:
         connection.sendall(head.encode())
@@ -554,7 +554,7 @@ def test_a_closing_http_server_hangs_up(served):
 
 @pytest.mark.parametrize("protocol", ["openpi", "arena"])
 def test_strangers_are_no_news(served, protocol, capfd, caplog):
-    """Whoever opens the port and sends nothing, nonsense or half a request leaves no traceback on the console."""
+    """A stranger that sends nothing, nonsense or half a request leaves no traceback on the console."""
     one = served(Remembers(), protocol)
     for data in (
         b"",

@@ -23,7 +23,7 @@ def made():
     servers = []
 
     def make(policy, **options):
-        servers.append(PolicyServer(policy, **({"max_sessions": 6, "max_wait": 0.05} | options)))
+        servers.append(PolicyServer(policy, **({"max_sessions": 6, "max_wait": 0.002} | options)))
         servers[-1].start()
         policy.calls = []
         return servers[-1]
@@ -94,7 +94,7 @@ def test_the_same_look_again_is_not_a_new_one(made):
 
 
 def test_another_look_at_the_same_step_is_a_new_one(made):
-    """What was answered is remembered for the same content only."""
+    """An answer is remembered for the same content only."""
     server = made(Remembers())
     chunks = episode(server, "a", 1, [0.1, 0.2])
     assert not np.array_equal(server.look("a", look(0.7, seed=1, step=4)).actions, chunks[1])
@@ -282,7 +282,7 @@ def test_pictures_are_fitted(made):
 
 
 def test_a_closed_server_refuses(made):
-    """Who waits when the server closes, and who comes later, is told so."""
+    """A session that waits when the server closes, and one that comes later, is told so."""
     server = made(Remembers(pause=0.2))
     waiting = together(lambda: server.look("a", look(seed=1, step=0)), lambda: (time.sleep(0.05), server.close())[0])
     with pytest.raises(Refused, match="closing"):

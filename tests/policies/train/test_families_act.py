@@ -76,7 +76,7 @@ def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
 
 
 def test_normalisation_is_lerobots(model):
-    """What the trainer does on the GPU is what LeRobot's processors do, constant numbers included."""
+    """Normalisation on the GPU is that of LeRobot's processors, constant numbers included."""
     observation = raw_observation()
     theirs = model.preprocess(dict(observation))
     for name in ("observation.images.front", "observation.state"):

@@ -226,7 +226,7 @@ def test_held_out_rows_are_not_sampled(store):
 
 
 def test_an_epoch_has_every_row_once():
-    """Whatever the batch and the number of processes, rows come once per epoch, in one order, from any step on."""
+    """Rows come once per epoch, in one order, from any step on, for any batch and number of processes."""
     samples = np.arange(100, 137)
     for batch, ranks in ((5, 1), (64, 1), (3, 2)):
         order = RowOrder(samples, 7, CPU)

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from arena_newton.tasks.open_door import TASK
-from arena_newton.usd_scenes import author, rooms, warehouse
+from scene_builders import author, rooms, warehouse
 
 POSITION = (-1.614, 2.314, 0.002)
 LEAF_SIZE = (1.0, 0.04, 2.14)

@@ -11,8 +11,8 @@ from pathlib import Path
 from pxr import Usd
 
 from arena_newton.robot.g1 import SPAWN_HEIGHT
-from arena_newton.usd_scenes import author, rooms
-from arena_newton.usd_scenes.football.build import BALL_MASS, BALL_RADIUS, ball
+from scene_builders import author, rooms
+from scene_builders.football import BALL_MASS, BALL_RADIUS, ball
 
 __all__ = ["BALL_PARKED", "PARKED", "SUPPORTS", "build"]
 

@@ -10,9 +10,9 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.tasks.base import ROOM
-from arena_newton.usd_scenes import author
-from arena_newton.usd_scenes.author import Vec
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author
+from scene_builders.author import Vec
+from scene_builders.solids import Solids
 
 __all__ = ["FLOOR_X", "FLOOR_Y", "boxes", "room", "room_looks", "rounded_box"]
 

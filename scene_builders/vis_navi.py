@@ -12,8 +12,8 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from arena_newton.tasks.vis_navi import TASK
-from arena_newton.usd_scenes import author, rooms, warehouse
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author, rooms, warehouse
+from scene_builders.solids import Solids
 
 BEAM_SIZE = (1.95, 0.38, 0.28)
 BEAM_MASS = 12.0

@@ -10,8 +10,8 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.boxing import TASK
-from arena_newton.usd_scenes import author, rooms, warehouse
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author, rooms, warehouse
+from scene_builders.solids import Solids
 
 BAG_RADIUS = 0.155
 BAG_Z = (0.40, 1.34)

@@ -1,8 +1,8 @@
 """Writes `g1.usda`: the Unitree G1 with Dex3 hands, floating base, variant set `hands = {dex3, fixed}`.
 
-Run as `python -m arena_newton.usd_scenes.g1.build`. Links stand flat under `/G1` at their poses for joint angles zero,
-joints under `/G1/joints`. Link and joint numbers are in `links.py`, outer shapes in `shells.py`; collision shapes and
-frames are here. Drives are not authored: the tracker that drives the robot brings its gains.
+Links stand flat under `/G1` at their poses for joint angles zero, joints under `/G1/joints`. Link and joint numbers are
+in `usd_scenes/g1/links.py`, outer shapes in `shells.py`; collision shapes and frames are here. Drives are not authored:
+the tracker that drives the robot brings its gains.
 """
 
 from collections.abc import Sequence
@@ -12,14 +12,11 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from arena_newton.robot.rotations import matrix_from_quat_np
-from arena_newton.usd_scenes import author
 from arena_newton.usd_scenes.g1.links import LINKS, PALM_OFFSET, Link
-from arena_newton.usd_scenes.g1.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge
+from scene_builders import author
+from scene_builders.shells import HAND_SHAPES, LOOKS, SHAPES, Block, Loft, Rod, grid, merge
 
-__all__ = ["PATH", "build", "fuse", "zero_poses"]
-
-PATH = Path(__file__).with_name("g1.usda")
-"""The committed layer."""
+__all__ = ["build", "fuse", "zero_poses"]
 
 ROOT = "/G1"
 HEAD_CAMERA = ((0.0576235, 0.01753, 0.42987), 0.8307767239493009)
@@ -106,9 +103,9 @@ def fuse(links: Sequence[Link]) -> tuple[float, np.ndarray, np.ndarray, np.ndarr
     return mass, center, moments, np.array([quat.GetReal(), *quat.GetImaginary()])
 
 
-def build(path: Path = PATH) -> None:
-    """Write the layer to `path`."""
-    stage = author.new_stage(Path(path), ROOT, scene=False)
+def build(folder: Path) -> None:
+    """Write `g1.usda` into `folder`."""
+    stage = author.new_stage(folder / "g1.usda", ROOT, scene=False)
     robot = stage.GetDefaultPrim()
     UsdPhysics.ArticulationRootAPI.Apply(robot)
     robot.AddAppliedSchema("NewtonArticulationRootAPI")
@@ -312,7 +309,3 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
 def _round(values: np.ndarray) -> np.ndarray:
     """To a hundredth of a millimetre, so that the text of the layer stays short [m]."""
     return np.round(np.asarray(values, dtype=float), 5) + 0.0
-
-
-if __name__ == "__main__":
-    build()

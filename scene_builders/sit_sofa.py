@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.sit_sofa import TASK
-from arena_newton.usd_scenes import author, rooms, warehouse
+from scene_builders import author, rooms, warehouse
 
 SOFA_X = (-4.34, -2.28)
 SOFA_Y = (-1.65, -0.83)

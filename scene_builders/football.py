@@ -8,8 +8,8 @@ from pathlib import Path
 from pxr import Usd
 
 from arena_newton.tasks.football import TASK
-from arena_newton.usd_scenes import author, rooms
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author, rooms
+from scene_builders.solids import Solids
 
 __all__ = ["build"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-__all__ = ["TEXTURES", "write_all"]
+__all__ = ["TEXTURES", "build"]
 
 SIDE = 128
 
@@ -193,7 +193,7 @@ TEXTURES: dict[str, Callable[[], np.ndarray]] = {draw.__name__: draw for draw in
 """Every texture by name; the file is `textures/<name>.png`."""
 
 
-def write_all(folder: Path) -> list[Path]:
+def build(folder: Path) -> list[Path]:
     """Write every texture as `<folder>/<name>.png`; the bytes are the same on every run."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from pxr import Usd
 
-from arena_newton.usd_scenes import author
-from arena_newton.usd_scenes.author import Vec
+from scene_builders import author
+from scene_builders.author import Vec
 
 __all__ = ["Solids"]
 

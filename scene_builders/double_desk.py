@@ -10,8 +10,8 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.double_desk import TASK
-from arena_newton.usd_scenes import author, rooms
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author, rooms
+from scene_builders.solids import Solids
 
 __all__ = ["build"]
 

@@ -9,9 +9,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from arena_newton.errors import InputError
 from arena_newton.tasks import TaskSpec
-from arena_newton.usd_scenes import author
-from arena_newton.usd_scenes.author import Vec
-from arena_newton.usd_scenes.solids import Solids
+from scene_builders import author
+from scene_builders.author import Vec
+from scene_builders.solids import Solids
 
 __all__ = ["SEMANTICS", "bench", "bind_in", "contact", "edit", "floor", "save", "task_stage", "workshop"]
 
