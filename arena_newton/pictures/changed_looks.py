@@ -1,7 +1,7 @@
 """Changed looks of pictures whose shapes are known: other colours, patterns, lights, things in the room, exposure.
 
 A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
-work can be captured in a CUDA graph. Texture and shading of a shape stay: each pixel's luminance over the mean of its
+work can be captured in a CUDA graph (`torch.where` with a number cannot: it would copy that to the device). Texture and shading of a shape stay: each pixel's luminance over the mean of its
 shape times the new colour. The robot and shapes whose colour matters keep theirs, and nothing is put before them.
 
 What semantic mode shows is not among the looks: every drawn colour is one of `palette`, which keeps its distance from
@@ -87,6 +87,10 @@ class Changes:
     """Gain, gamma, cast, a smooth field, noise."""
 
 
+USUAL = Changes()
+"""Changes of a training."""
+
+
 def seen_colours(albedo: np.ndarray) -> np.ndarray:
     """Colours of surfaces in a picture under the scenes' dome, sRGB from 0 to 1, shape [n · 5, 3].
 
@@ -117,7 +121,7 @@ def changed_looks(
     chances: torch.Tensor,
     objects: torch.Tensor,
     task: torch.Tensor,
-    changes: Changes = Changes(),  # noqa: B008  # a constant
+    changes: Changes = USUAL,
 ) -> torch.Tensor:
     """Change the look of every sample of a batch, each in its own way.
 
@@ -253,10 +257,12 @@ def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> t
     field = torch.rand((batch, 2, 24, 24), device=device)
     where = torch.stack([torch.remainder(u / 4.0, 2.0), torch.remainder(v / 4.0, 2.0)], dim=-1) - 1.0
     cloud = torch.nn.functional.grid_sample(field, where[:, None], padding_mode="border", align_corners=True)[:, :, 0]
-    blotch = (cloud[:, 0] > 0.55).long() + (cloud[:, 0] > 0.55).long() * (cloud[:, 1] > 0.6).long()
-    tiled = torch.where(joints, 1, 2 * speckled.long())
-    striped = torch.where(stripes < 0.5 * line * 6.0, 1, torch.where(stripes > 1.0 - mixed * 0.4, 2, 0))
-    return torch.where(kind == 0, blotch, torch.where(kind == 1, striped, torch.where(kind <= 3, tiled, 0)))
+    first = torch.stack([cloud[:, 0] > 0.55, stripes < 3.0 * line, joints])
+    second = torch.stack([cloud[:, 1] > 0.6, stripes > 1.0 - 0.4 * mixed, ~joints & speckled])
+    second[0] &= first[0]
+    second[1] &= ~first[1]
+    which = first.long() * ~second + 2 * second.long()
+    return which.gather(0, kind.clamp_max(2)[None])[0] * (kind <= 3)
 
 
 def _with_things(
@@ -308,7 +314,7 @@ def _exposed(pictures: torch.Tensor, probability: float) -> torch.Tensor:
 
     def drawn(low: float, high: float, *shape: int) -> torch.Tensor:
         value = torch.rand((batch, *shape), device=device) * (high - low) + low
-        return torch.where(_happens(batch, probability, device).view(-1, *(1,) * len(shape)), value, 1.0)
+        return 1.0 + (value - 1.0) * _happens(batch, probability, device).view(-1, *(1,) * len(shape))
 
     field = torch.nn.functional.interpolate(
         drawn(0.75, 1.25, 1, 3, 4), size=(height, width), mode="bilinear", align_corners=True

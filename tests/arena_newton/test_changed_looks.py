@@ -9,7 +9,6 @@ from pxr import Usd, UsdGeom, UsdShade
 from arena_newton.physics.scene import SCENES
 from arena_newton.pictures import changed_looks as looks
 from arena_newton.pictures.changed_looks import Changes, changed_looks, palette, recoloured, seen_colours
-from arena_newton.usd_scenes.rooms import SEMANTICS
 
 CPU = torch.device("cpu")
 BATCH, HEIGHT, WIDTH = 32, 24, 32
@@ -60,7 +59,7 @@ def semantic_colours():
 def bound(scene, variant):
     """Prims that are drawn in a variant, by their texture's name or their colour."""
     stage = Usd.Stage.Open(str(scene))
-    stage.GetDefaultPrim().GetVariantSet(SEMANTICS).SetVariantSelection(variant)
+    stage.GetDefaultPrim().GetVariantSet("semantics").SetVariantSelection(variant)
     found = {}
     for prim in Usd.PrimRange(stage.GetDefaultPrim()):
         path = str(prim.GetPath())
