@@ -134,8 +134,6 @@ def dataset_looks(root: Path, episodes: int) -> list[DatasetLooks | None]:
     Raises:
         InputError: The list is damaged, of another version or of other episodes, or a film is missing.
     """
-    from arena_newton.data.readers.dataset_files import read_json  # which needs the extra [data]
-
     path = root / LOOKS_FOLDER / "looks.json"
     if not path.parent.is_dir():
         return [None] * episodes
