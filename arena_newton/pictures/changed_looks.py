@@ -1,8 +1,9 @@
 """Changed looks of pictures whose shapes are known: other colours, patterns, lights, things in the room, exposure.
 
 A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
-work can be captured in a CUDA graph. Texture and shading of a shape stay: each pixel's luminance over the mean of its
-shape times the new colour. The robot and shapes whose colour matters keep theirs, and nothing is put before them.
+work can be captured in a CUDA graph (`torch.where` with a number cannot: it would copy that to the device). Texture and
+shading of a shape stay: each pixel's luminance over the mean of its shape times the new colour. The robot and shapes
+whose colour matters keep theirs, and nothing is put before them.
 
 What semantic mode shows is not among the looks: every drawn colour is one of `palette`, which keeps its distance from
 `SEMANTIC_COLOURS`; so a brick is never drawn in the colour of that mode's bricks. Lights are those of the recording.
@@ -87,6 +88,10 @@ class Changes:
     """Gain, gamma, cast, a smooth field, noise."""
 
 
+USUAL = Changes()
+"""Changes of a training."""
+
+
 def seen_colours(albedo: np.ndarray) -> np.ndarray:
     """Colours of surfaces in a picture under the scenes' dome, sRGB from 0 to 1, shape [n · 5, 3].
 
@@ -102,7 +107,7 @@ def palette(device: torch.device) -> torch.Tensor:
     """All colours that shapes may get, sRGB from 0 to 1, float32, shape [4096, 3]."""
     rng = np.random.default_rng(0)
     hue, grey, saturation, value = rng.random((4, 4 * COLOURS))
-    saturation = np.where(grey < 0.35, 0.25 * saturation, 0.2 + 0.75 * saturation)
+    saturation = np.where(grey < 0.5, 0.25 * saturation, 0.2 + 0.75 * saturation)
     value = 0.06 + 0.88 * value
     offsets = (hue[:, None] * 6.0 + np.array([5.0, 3.0, 1.0])) % 6.0
     drawn = value[:, None] * (1.0 - saturation[:, None] * np.clip(np.minimum(offsets, 4.0 - offsets), 0.0, 1.0))
@@ -117,13 +122,14 @@ def changed_looks(
     chances: torch.Tensor,
     objects: torch.Tensor,
     task: torch.Tensor,
-    changes: Changes = Changes(),  # noqa: B008  # a constant
+    changes: Changes = USUAL,
 ) -> torch.Tensor:
     """Change the look of every sample of a batch, each in its own way.
 
     Args:
         seen: Pictures, uint8, shape [B, H, W, 3].
-        frames: Their looks, a shape and two light ratios per pixel, uint8, shape [B, H, W, 3] (`data.readers.looks`).
+        frames: Their looks, a shape and one or two light ratios per pixel, uint8, shape [B, H, W, 2 or 3]
+            (`data.readers.looks`).
         chances: Probability of another colour of each shape, float32, shape [B, 256].
         objects: First shape of the object that each shape is part of, int64, shape [B, 256].
         task: Number of each sample's task, int64, shape [B]; things are cut out of another task's pictures.
@@ -144,7 +150,7 @@ def changed_looks(
     pixels = _with_things(pixels, luma, owner, chance, free, task, (height, width), changes.things)
     inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
     pixels = torch.where(inside[..., None], _colours((batch, 1), device), pixels)
-    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., 2]).float()
+    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., -1]).float()
     ratio = torch.exp2((lit.reshape(batch, -1) - 128.0) / 32.0)
     weight = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.light, device)
     pixels = pixels * (1.0 + weight * (ratio - 1.0))[..., None]
@@ -252,10 +258,12 @@ def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> t
     field = torch.rand((batch, 2, 24, 24), device=device)
     where = torch.stack([torch.remainder(u / 4.0, 2.0), torch.remainder(v / 4.0, 2.0)], dim=-1) - 1.0
     cloud = torch.nn.functional.grid_sample(field, where[:, None], padding_mode="border", align_corners=True)[:, :, 0]
-    blotch = (cloud[:, 0] > 0.55).long() + (cloud[:, 0] > 0.55).long() * (cloud[:, 1] > 0.6).long()
-    tiled = torch.where(joints, 1, 2 * speckled.long())
-    striped = torch.where(stripes < 0.5 * line * 6.0, 1, torch.where(stripes > 1.0 - mixed * 0.4, 2, 0))
-    return torch.where(kind == 0, blotch, torch.where(kind == 1, striped, torch.where(kind <= 3, tiled, 0)))
+    first = torch.stack([cloud[:, 0] > 0.55, stripes < 3.0 * line, joints])
+    second = torch.stack([cloud[:, 1] > 0.6, stripes > 1.0 - 0.4 * mixed, ~joints & speckled])
+    second[0] &= first[0]
+    second[1] &= ~first[1]
+    which = first.long() * ~second + 2 * second.long()
+    return which.gather(0, kind.clamp_max(2)[None])[0] * (kind <= 3)
 
 
 def _with_things(
@@ -307,7 +315,7 @@ def _exposed(pictures: torch.Tensor, probability: float) -> torch.Tensor:
 
     def drawn(low: float, high: float, *shape: int) -> torch.Tensor:
         value = torch.rand((batch, *shape), device=device) * (high - low) + low
-        return torch.where(_happens(batch, probability, device).view(-1, *(1,) * len(shape)), value, 1.0)
+        return 1.0 + (value - 1.0) * _happens(batch, probability, device).view(-1, *(1,) * len(shape))
 
     field = torch.nn.functional.interpolate(
         drawn(0.75, 1.25, 1, 3, 4), size=(height, width), mode="bilinear", align_corners=True

@@ -145,7 +145,7 @@ class Recording:
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
     record_looks: int = 0
-    """Write what every fifth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
+    """Write what every fourth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ class _Demonstrations:
     depth: bool = False
     """Write the depth of each picture too, float16 [m]."""
     looks: int = 0
-    """Write what every fifth picture shows and its light under so many second lights, 1 or 2, so that a training can
+    """Write what every fourth picture shows and its light under so many second lights, 1 or 2, so that a training can
     change its looks (docs/recording.md)."""
 
 

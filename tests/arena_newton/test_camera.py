@@ -249,6 +249,20 @@ def test_bad_input_is_named(model):
         lights.set(0, SimpleNamespace(direction=(0, 0, 0), intensity=1.0, color=(1, 1, 1)))
 
 
+def test_the_last_render_under_other_lights(model):
+    """`relit` shows what a render under these lights would, of the worlds asked for; the picture stays."""
+    lights, others = WorldLights.allocate(WORLDS, "cpu"), WorldLights.allocate(WORLDS, "cpu")
+    others.set(0, _light((1, 0, -2)))
+    others.set(2, None, dome_intensity=900.0)
+    camera = _camera(model, lights)
+    before = camera.render(model.state()).numpy().copy()
+    found = camera.relit(others, np.array([True, False, True])).numpy()
+    assert np.array_equal(camera.image.numpy(), before)
+    wanted = _camera(model, others).render(model.state()).numpy()
+    assert np.array_equal(found[[0, 2]], wanted[[0, 2]]) and not found[1].any()
+    assert np.array_equal(camera.render(model.state()).numpy(), before)
+
+
 def test_each_pixel_names_its_shape(model):
     """A pixel names what it shows: the box of its own world in the middle, no shape above the horizon."""
     lights = WorldLights.allocate(WORLDS, "cpu")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, write_episode
+from arena_newton.data.recording.source_videos import source_looks
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.play.run import Factories
 
@@ -32,9 +33,9 @@ def bare(tmp_path_factory, parts):
 
 @pytest.fixture(scope="module")
 def filmed(bare, tmp_path_factory, parts):
-    """The same with pictures of two cameras and depth, played in one world."""
+    """The same with pictures of two cameras, depth and looks, played in one world."""
     folder = tmp_path_factory.mktemp("filmed") / "out"
-    cameras = ["--cameras", "front", "world", "--size", "64x48", "--depth", "--worlds", "1"]
+    cameras = ["--cameras", "front", "world", "--size", "64x48", "--depth", "--looks", "2", "--worlds", "1"]
     assert main(["record", "--from", str(bare), *cameras, "--out", str(folder)], parts) == 0
     return folder
 
@@ -66,6 +67,7 @@ def test_cameras_are_added_and_nothing_else_changes(bare, filmed):
         assert depth.dtype == np.float16 and depth.shape == (file.rows, 48, 64)
         assert 0.5 < np.median(depth) < 20 and np.isfinite(depth).all()
         assert bool(file.array("rerecord_any_success")) and float(file.array("rerecord_final_reward")) == 1.0
+        assert len(source_looks(file)[0].lights) == 2
 
 
 def test_a_second_camera_joins_the_first_and_the_source_stays(filmed, tmp_path, capsys, parts):
@@ -77,6 +79,7 @@ def test_a_second_camera_joins_the_first_and_the_source_stays(filmed, tmp_path, 
     old, new = (EpisodeFile(episode_files([folder])[0]) for folder in (filmed, tmp_path))
     assert new.cameras == ("front", "left_wrist", "world")
     assert new.video("front").read_bytes() == old.video("front").read_bytes()
+    assert new.looks("front")[0] == old.looks("front")[0] and source_looks(new) is not None
     assert "largest deviation of a position from the recording: 0\n" in capsys.readouterr().out
     written = digest(tmp_path)
     assert main(command, parts) == 0  # what is there is not played again

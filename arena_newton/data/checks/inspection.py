@@ -119,6 +119,8 @@ def inspect(folders: Sequence[Path], options: InspectOptions) -> int:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
     if not 2 <= options.pictures <= 40:
         raise InputError(f"--pictures {options.pictures}: expected 2 to 40")
+    if not 0 <= options.looks <= 100:
+        raise InputError(f"--looks {options.looks}: expected 0 to 100")
     found = figures(motions(folders))
     order = {id(one): rank for rank, one in enumerate(ranked(found))}
     chosen = {number for number, one in enumerate(found) if order[id(one)] < options.episodes}
@@ -127,7 +129,7 @@ def inspect(folders: Sequence[Path], options: InspectOptions) -> int:
     with bar:
         for number, motion in enumerate(motions(folders)):
             if number in chosen:
-                shown.append(_shown(motion, found[number], options.pictures))
+                shown.append(_shown(motion, found[number], options.pictures, options.looks))
                 bar.update()
     text = page(found, shown, ", ".join(folder.name for folder in folders))
     out = options.out.expanduser()
@@ -172,30 +174,40 @@ def page(found: Sequence[EpisodeFigures], shown: Sequence[Shown], title: str) ->
     )
 
 
-def _shown(motion: Motion, about: EpisodeFigures, count: int) -> Shown:
+def _shown(motion: Motion, about: EpisodeFigures, count: int, looks: int) -> Shown:
     picks = evenly(motion.rows, count)
-    strip = Markup("") if motion.video is None else _strip(motion, picks)
+    if looks and motion.looks is not None:
+        picks = [pick - pick % motion.looks[0].stride for pick in picks]
+    strip = Markup("") if motion.video is None else _strip(motion, picks, looks)
     times = tuple(f"{pick * g1.TICK:.1f} s" for pick in picks)
     return Shown(motion, about, strip, times, _bands(motion), tuple(_panels(motion)))
 
 
-def _strip(motion: Motion, picks: Sequence[int]) -> Markup:
-    """Pictures next to each other as a JPEG."""
+def _strip(motion: Motion, picks: Sequence[int], looks: int) -> Markup:
+    """Pictures next to each other as a JPEG, and rows of them under changed looks."""
     try:
         video = OpenVideo(Path(motion.video or ""))
         try:
             frames = [video.read(motion.first + pick) for pick in picks]
         finally:
             video.close()
+        rows = [frames]
+        if looks and motion.looks is not None:
+            from arena_newton.data.checks.look_sheet import changed_rows  # which loads torch
+
+            rows += changed_rows(frames, picks, *motion.looks, looks)
     except (av.error.FFmpegError, OSError, IndexError, AttributeError) as error:  # a stream without a codec is None
-        raise InputError(f"{motion.video}: not a readable video ({type(error).__name__})") from error
+        name = getattr(error, "filename", None) or motion.video
+        raise InputError(f"{name}: not a readable video ({type(error).__name__})") from error
     height = frames[0].shape[0]
     size = max(1, round(frames[0].shape[1] * STRIP_HEIGHT / height)), STRIP_HEIGHT
     how = cv2.INTER_AREA if height > STRIP_HEIGHT else cv2.INTER_NEAREST
-    small = [cv2.resize(frame, size, interpolation=how) for frame in frames]
     gap = np.full((STRIP_HEIGHT, GAP, 3), 128, np.uint8)
-    parts = [part for picture in small for part in (picture, gap)]
-    strip = cv2.cvtColor(np.concatenate(parts[:-1], axis=1), cv2.COLOR_RGB2BGR)
+    strips = []
+    for row in rows:
+        parts = [part for one in row for part in (cv2.resize(one, size, interpolation=how), gap)]
+        strips.append(np.concatenate(parts[:-1], axis=1))
+    strip = cv2.cvtColor(np.concatenate(strips), cv2.COLOR_RGB2BGR)
     encoded = cv2.imencode(".jpg", strip, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     return Markup(base64.b64encode(encoded.tobytes()).decode())
 

@@ -114,3 +114,5 @@ class InspectOptions:
     """Most episodes in full, the most unusual ones; the table has all."""
     pictures: int = 10
     """Pictures of a film strip."""
+    looks: int = 0
+    """Rows of the same pictures under changed looks below each strip, of episodes that were recorded with --looks."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arena_newton.cli.extras import require
+from arena_newton.data.readers.looks import Looks, dataset_looks
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened
 from arena_newton.errors import InputError
 from arena_newton.robot.canonical import STATE_WIDTH
@@ -41,6 +42,8 @@ class Motion:
     video: Path | None = None
     first: int = 0
     """Number of its first frame in the video."""
+    looks: tuple[Looks, Path] | None = None
+    """Looks of its pictures, and their film."""
 
     @property
     def rows(self) -> int:
@@ -75,6 +78,7 @@ def _of_file(episode: EpisodeFile) -> Motion:
         action=episode.action,
         phases=tuple(episode.phases),
         video=None if camera is None else episode.video(camera),
+        looks=None if camera is None else episode.looks(camera),
     )
 
 
@@ -84,7 +88,7 @@ def _of_dataset(folder: Path) -> Iterator[Motion]:
 
     actions = DatasetActions(folder)
     files = actions.files
-    listed = described(files)
+    listed, looks = described(files), dataset_looks(folder, files.episodes)
     for row in files.episode_rows:
         about = {} if listed is None else listed[row.index]
         seed = about.get("episode_seed")
@@ -101,6 +105,7 @@ def _of_dataset(folder: Path) -> Iterator[Motion]:
             action=action,
             video=None if part is None else part.path,
             first=0 if part is None else part.first,
+            looks=None if (film := looks[row.index]) is None else (film.looks, film.path),
         )
 
 

@@ -20,7 +20,7 @@ from arena_newton.data.recording.encoding import EncoderThreads, Pictured, Video
 from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
 from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
 from arena_newton.data.recording.look_planes import LookPlanes
-from arena_newton.errors import ArenaError
+from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
 from arena_newton.pictures.camera import Camera
@@ -158,6 +158,8 @@ class DemonstrationRecorder(Recorder):
         """
         self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
         self.looks = looks
+        if looks and "front" not in self.cameras:
+            raise InputError("looks: are those of the camera front, which is not recorded")
         self._planes: LookPlanes | None = None
         self.seeds, self.only_success, self.finishing = seeds, only_success, finishing
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)

@@ -24,8 +24,8 @@ from arena_newton.tasks.base import LightDraw
 
 __all__ = ["STRIDE", "LookPlanes", "second_light", "visual_angle"]
 
-STRIDE = 5
-"""Rows from one frame of looks to the next: 0.1 s, in which little moves."""
+STRIDE = 4
+"""Rows from one frame of looks to the next: 0.08 s, in which little moves."""
 KEY = 0x6C6F6F6B
 """Separates the second lights' generator from all others."""
 ROBOT = "/World/Robot/"

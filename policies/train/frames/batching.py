@@ -17,6 +17,8 @@ __all__ = ["BalancedOrder", "BatchMaker", "RowOrder", "step_seed"]
 
 MIX = 0x9E3779B97F4A7C15
 """Odd number by which steps are spread over the seeds (the golden ratio of 2^64, as in splitmix64)."""
+BLOCK_STEPS = 256
+"""Steps whose balanced rows are drawn at once."""
 UNKNOWN_FRACTION = 0.05
 """Fraction of the training samples whose tracker is said to be another than those of the vector: for play through one
 of which there are no demonstrations."""
@@ -69,7 +71,8 @@ class RowOrder:
 class BalancedOrder:
     """Rows drawn independently: first a group of them, by its weight, then any of the group's rows.
 
-    Drawn on the CPU from seed, step and process alone, as the order of `RowOrder` is.
+    Drawn on the CPU from seed, step and process alone, as the order of `RowOrder` is, for many steps at once: a copy to
+    a GPU waits for what it does.
     """
 
     def __init__(
@@ -89,13 +92,20 @@ class BalancedOrder:
         self._starts = self._counts.cumsum(0) - self._counts
         self._weights = torch.tensor(weights, dtype=torch.float64)
         self._seed, self._device = seed, device
+        self._block: tuple[int, int, int] | None = None
+        """Number of the block of steps that is drawn, samples of a step and process."""
+        self._rows = torch.zeros(0)
 
     def rows(self, step: int, batch: int, *, rank: int = 0, ranks: int = 1) -> torch.Tensor:
         """Rows of a step of one process, int64, shape [batch]; `ranks` does not count."""
-        generator = torch.Generator().manual_seed(step_seed(self._seed, step, rank=-3 - rank))
-        group = torch.multinomial(self._weights, batch, replacement=True, generator=generator)
-        within = torch.rand(batch, dtype=torch.float64, generator=generator) * self._counts[group]
-        return self._samples[self._starts[group] + within.long()].to(self._device)
+        number, at = divmod(step, BLOCK_STEPS)
+        if self._block != (number, batch, rank):
+            generator = torch.Generator().manual_seed(step_seed(self._seed, number, rank=-3 - rank))
+            group = torch.multinomial(self._weights, BLOCK_STEPS * batch, replacement=True, generator=generator)
+            within = torch.rand(len(group), dtype=torch.float64, generator=generator) * self._counts[group]
+            self._rows = self._samples[self._starts[group] + within.long()].view(-1, batch).to(self._device)
+            self._block = number, batch, rank
+        return self._rows[at]
 
 
 @dataclass

@@ -25,7 +25,7 @@ class LookStore:
     """Frames of looks of all episodes that have some, on the device of their pictures."""
 
     frames: torch.Tensor
-    """A shape and two light ratios per pixel, uint8, shape [frames, height, width, 3], cut as the pictures."""
+    """A shape and one or two light ratios per pixel, uint8, shape [frames, height, width, 2 or 3], cut as pictures."""
     number: torch.Tensor
     """Frame of each row, or of the last row before it that has one, int64, shape [rows]; -1: none."""
     back: torch.Tensor
@@ -82,7 +82,7 @@ def load_looks(
     number -= 1
     tables: dict[tuple[tuple[str, float], ...], int] = {}
     chances, objects = [np.zeros(256, np.float32)], [np.zeros(256, np.int64)]
-    row = count = 0
+    row = count = lights = 0
     for dataset in datasets:
         listed = dataset_looks(dataset.root, DatasetFiles(dataset.root).episodes)
         if not any(listed):
@@ -91,6 +91,7 @@ def load_looks(
             rows = np.arange(episode.length)
             if film is not None:
                 looks, mine = film.looks, slice(row, row + episode.length)
+                lights = max(lights, len(looks.lights))
                 step = math.lcm(looks.stride, store.every)  # rows that have a picture too
                 frames = -(-episode.length // step)
                 number[mine], back[mine] = count + rows // step, rows % step
@@ -102,16 +103,17 @@ def load_looks(
                 count += frames
             row += episode.length
     height, width, device = store.height, store.width, store.device
-    size, free = count * int(store.pictures[0].numel()), free_memory(device) - network
+    shape = (count, *store.pictures.shape[1:3], 1 + lights)
+    size, free = math.prod(shape), free_memory(device) - network
     if size > free:
         raise InputError(
             f"--looks: {count} frames need {size / 1e9:.1f} GB of memory on {device}, {max(0, free) / 1e9:.1f} GB are "
             "free beside pictures and network"
         )
-    stored = torch.empty((count, *store.pictures.shape[1:]), dtype=torch.uint8, device=device)
+    stored = torch.empty(shape, dtype=torch.uint8, device=device)
 
     def put(first: int, found: np.ndarray) -> None:
-        stored[first : first + len(found)].copy_(torch.from_numpy(found))
+        stored[first : first + len(found)].copy_(torch.from_numpy(found[..., : 1 + lights]))
 
     cores = jobs or len(os.sched_getaffinity(0))
     processes = decoding_processes(cores, count)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 
 from arena_newton import tasks
+from arena_newton.data.readers.looks import FIRST_SHAPE, Looks
 from arena_newton.data.recording.demonstration import FPS
 from arena_newton.data.recording.episode import SCHEMA_VERSION, vision, write_episode
 from arena_newton.data.recording.image_statistics import VALUES, add_picture
@@ -23,6 +24,20 @@ def pictures(rows, size, seed):
     return found
 
 
+LOOKS = Looks(5, ((900.0,), (4000.0, 0.6, 0.0, -0.8)), (("/World/Room/Floor", 1.0), ("/World/Target/Ball", 0.0)))
+"""Looks of made recordings: two lights and shapes."""
+
+
+def look_frames(count, size, seed):
+    """Frames of looks: robot to the left, floor below, a ball to the right, and light ratios about 1."""
+    found = np.zeros((count, size, size, 3), np.uint8)
+    shown = found[:, size // 8 : -size // 8]
+    shown[..., 0] = FIRST_SHAPE
+    shown[:, :, : size // 4, 0], shown[:, : size // 4, -size // 4 :, 0] = 1, FIRST_SHAPE + 1
+    shown[..., 1:] = np.random.default_rng(seed).integers(120, 137, (*shown.shape[:3], 2))
+    return found
+
+
 def make_episode(
     folder,
     rows=40,
@@ -33,9 +48,13 @@ def make_episode(
     outcome="success",
     size=32,
     cameras=("front",),
+    looks=None,
     **more,
 ):
-    """Write one recording; `more` are arrays that are changed or added, None drops them. Returns the NPZ."""
+    """Write one recording; `more` are arrays that are changed or added, None drops them. Returns the NPZ.
+
+    `looks` describes looks that it gets too.
+    """
     rng = np.random.default_rng(repeat)
     spec = tasks.get(task)
     seed = seeding.recording_seed(spec.gym_id, seeding.DEMONSTRATION, 0, repeat)
@@ -102,6 +121,12 @@ def make_episode(
             f"arena_{vision(camera, 'codec')}": np.str_(json.dumps(codec)),
             f"arena_{vision(camera, 'histogram')}": histogram,
         }
+    if looks is not None:
+        film = folder / "videos" / f"{stem}_front_looks.mp4"
+        with VideoWriter(film, size, size, FPS / looks.stride, gop=10, b_frames=False, lossless=True) as writer:
+            for frame in look_frames(looks.frames(rows), size, repeat):
+                writer.write(frame)
+        fields["arena_vision_looks"] = np.str_(json.dumps(looks.plain()))
     fields |= {
         "arena_state": state,
         "arena_action": action,

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from arena_newton import policies, trackers
+from arena_newton.data.readers.frame_reader import OpenVideo
+from arena_newton.data.readers.looks import FIRST_SHAPE
 from arena_newton.data.recording.demonstration import DemonstrationRecorder, episode_label
 from arena_newton.data.recording.episode import (
     CAMERAS,
@@ -54,10 +56,10 @@ def env():
 
 @pytest.fixture(scope="module")
 def folder(env, tmp_path_factory):
-    """Two short episodes with pictures of two cameras and depth."""
+    """Two short episodes with pictures of two cameras, depth, and looks."""
     folder = tmp_path_factory.mktemp("episodes")
     cameras = {"front": CameraConfig(64, 64), "world": CameraConfig(64, 48, "world", "native")}
-    with DemonstrationRecorder(folder, cameras=cameras, depth=True, facts={"a": 1}, threads=2) as recorder:
+    with DemonstrationRecorder(folder, cameras=cameras, depth=True, looks=1, facts={"a": 1}, threads=2) as recorder:
         episodes = [planned(0), planned(1)]
         Rollout(env, policies.get("stand"), episodes, recorder=recorder, max_steps=TICKS).run()
         saved = recorder.saved(wait=True)
@@ -80,6 +82,8 @@ def test_the_file_holds_the_fields_of_the_table(folder):
         for thing in objects:
             for camera in cameras:
                 name = field.name.replace("<object>", thing).replace("<camera>", camera)
+                if camera and name.endswith("looks"):  # which are the head camera's
+                    continue
                 array = file.array(name)
                 seen.add(name)
                 expected = field.shape.replace("H", "48" if camera else "64").replace("W", "64")
@@ -120,6 +124,26 @@ def test_depth_is_of_the_pictures(folder):
     square, native = file.array("vision_depth"), file.array(vision("world", "depth"))
     assert square.shape == (file.rows, 64, 64) and native.shape == (file.rows, 48, 64)
     assert not square[:, :8].any() and not square[:, 56:].any() and square[:, 8:56].min() > 0.05
+
+
+def test_looks_are_of_the_pictures(folder):
+    """Every fourth row has a frame: shapes and light where the lens sees, nothing in the bars; equal with one light."""
+    for path in episode_files([folder]):
+        file = EpisodeFile(path)
+        looks, film = file.looks("front")
+        video = OpenVideo(film)
+        frames = np.stack([video.read(number) for number in range(len(video.times))])
+        video.close()
+        assert frames.shape == (looks.frames(file.rows), 64, 64, 3) and looks.stride == 4 and len(looks.lights) == 1
+        bars, seen = frames[:, [*range(8), *range(56, 64)]], frames[:, 8:56]
+        assert (bars == (0, 128, 128)).all() and np.array_equal(frames[..., 1], frames[..., 2])
+        prims = dict(looks.shapes)
+        assert {*np.unique(seen[..., 0])} <= {*range(1, FIRST_SHAPE + len(prims))} and (seen[..., 0] == 1).any()
+        floor = FIRST_SHAPE + [*prims].index("/World/Room/Floor")
+        assert (seen[..., 0] == floor).mean() > 0.1 and (seen[..., 1] != 128).mean() > 0.5
+        assert {prim: chance for prim, chance in prims.items() if chance < 1.0} == {"/World/Target/Frame/Ball": 0.0}
+    lights = [EpisodeFile(path).looks("front")[0].lights for path in episode_files([folder])]
+    assert lights[0] != lights[1]
 
 
 def test_an_episode_without_a_success_can_be_left_out(env, tmp_path):

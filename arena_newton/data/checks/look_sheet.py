@@ -1,0 +1,48 @@
+"""Pictures of an episode under changed looks, as a training sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from arena_newton.data.readers.frame_reader import OpenVideo
+from arena_newton.data.readers.looks import Looks
+from arena_newton.pictures.changed_looks import changed_looks
+
+__all__ = ["changed_rows"]
+
+
+def changed_rows(
+    pictures: Sequence[np.ndarray], rows: Sequence[int], looks: Looks, film: Path, count: int
+) -> list[list[np.ndarray]]:
+    """Change the looks of pictures; things are cut out of each other.
+
+    Args:
+        pictures: uint8, each of shape [H, W, 3].
+        rows: Their rows of the episode, which have frames of looks.
+        looks: Meaning of these.
+        film: Film of looks.
+        count: Looks of each picture.
+
+    Returns:
+        For each look all pictures, uint8, shape [H, W, 3].
+    """
+    video = OpenVideo(film)
+    try:
+        frames = np.stack([video.read(row // looks.stride) for row in rows])
+    finally:
+        video.close()
+    chances, objects = torch.from_numpy(looks.chances()), torch.from_numpy(looks.objects())
+    number, seen = torch.arange(len(rows)), torch.from_numpy(np.stack(pictures))
+    with torch.random.fork_rng([]):
+        torch.manual_seed(len(rows))
+        changed = [
+            changed_looks(
+                seen, torch.from_numpy(frames), *(one.expand(len(rows), -1) for one in (chances, objects)), number
+            )
+            for _ in range(count)
+        ]
+    return [list((255.0 * one).round().byte().numpy()) for one in changed]
