@@ -106,11 +106,11 @@ def _run(arguments: list[str]) -> int:
 
 def _rules(arguments: list[str]) -> int:
     if arguments:
-        said = "takes no arguments; it prints both rule sets as Markdown"
+        text = "takes no arguments; it prints both rule sets as Markdown"
         if {*arguments} & {"-h", "--help"}:
-            print(f"usage: {PROG} rules\n\nrules {said}.")
+            print(f"usage: {PROG} rules\n\nrules {text}.")
             return 0
-        raise InputError(f"rules {arguments[0]}: {said}")
+        raise InputError(f"rules {arguments[0]}: {text}")
     from arena_newton import rule_sets
 
     print(rule_sets.markdown(), end="")

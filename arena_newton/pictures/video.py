@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import av
 import cv2
@@ -97,15 +97,16 @@ class VideoWriter:
         self._container: av.container.OutputContainer | None
         self._container = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(float(fps)).limit_denominator(1000)
-        codec = "libx264rgb" if lossless else "libx264"
-        self._stream = cast("av.VideoStream", self._container.add_stream(codec, rate=rate))
+        stream = self._container.add_stream("libx264rgb" if lossless else "libx264", rate=rate)
+        assert isinstance(stream, av.VideoStream)
+        self._stream = stream
         self._stream.height, self._stream.width = self._size
         self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
         # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
         # Without mbtree: it reads memory that nobody wrote, so that equal frames give different bytes now and then.
-        name, value = ("qp", "0") if lossless else ("crf", str(crf))
-        self._stream.options = {name: value, "preset": "veryfast", "mbtree": "0"}
+        quality: dict[str, object] = {"qp": "0"} if lossless else {"crf": str(crf)}
+        self._stream.options = quality | {"preset": "veryfast", "mbtree": "0"}
         if gop is not None:
             self._stream.options |= {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
         if not b_frames:

@@ -20,9 +20,9 @@ from arena_newton.eval.records import document as documents
 from arena_newton.eval.records.document import CONFIG_FILE, Document, read_document
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import JsonObject, check_types
 from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import plain_text
 
 __all__ = [
@@ -95,7 +95,7 @@ class ResultsFolder:
         """Name the folder, the run and the versions of the libraries; nothing is read or written."""
         self.path, self.config, self.installed = path, config, dict(installed)
         self.document: Document
-        """Content of config.json, once the folder is settled."""
+        """Content of config.json, once the folder is prepared."""
 
     @property
     def journal(self) -> Path:
@@ -167,7 +167,7 @@ class ResultsFolder:
         except OSError as error:
             raise InputError(f"--out {self.path}: cannot be created ({error.strerror})") from None
 
-    def settle(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
+    def prepare(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
         """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
         `config` now has what tracker and policy say of themselves; `played` are the lines of the journal.

@@ -45,8 +45,8 @@ from arena_newton.eval.records.identity import (
     own_code,
     scenes_hash,
 )
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.physics.devices import cluster_engine, resolve_engine
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig, Fit, robot_fit, video_sizes

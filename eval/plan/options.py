@@ -72,12 +72,12 @@ class Chunks:
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
     itself when none is named, and v3.1 where it says nothing."""
     replan: int | None = None
-    """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
+    """For --policy lerobot: execute only the first so many actions of each chunk, then query it again."""
     ensemble: bool = False
-    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; looks every 2 ticks, or as
+    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; queried every 2 ticks, or as
     --replan says."""
     latency_ticks: int = 0
-    """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
+    """Ticks of 0.02 s from a policy's query to the first action of its chunk; the chunk before goes on meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Ray:
     ray_gpus: float | None = None
     """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
     ray_minutes: float = 60.0
-    """With --ray: a slice of a run, at most two batches of worlds, that takes longer is stopped and played again."""
+    """With --ray: a batch of episodes, at most twice --worlds, that takes longer is stopped and played again."""
     ray_attempts: int = 3
     """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
 

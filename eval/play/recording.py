@@ -25,7 +25,7 @@ from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.records.identity import moving_versions, scenes_hash
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 
 __all__ = [

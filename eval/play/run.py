@@ -181,7 +181,7 @@ def _play(
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
     folder.make()
     with Journal(folder.journal) as journal:
-        folder.settle(config, journal.records)
+        folder.prepare(config, journal.records)
         folder.sweep()
         run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:

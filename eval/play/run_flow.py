@@ -83,7 +83,7 @@ def groups(episodes: Iterable[Episode]) -> dict[Group, list[Episode]]:
 def begun(
     config: RunConfig, folder: ResultsFolder, journal: Journal
 ) -> tuple[dict[int, EpisodeRecord], dict[Group, list[Episode]]]:
-    """Say what is to be played in a folder that was settled.
+    """Say what is to be played in a folder that was prepared.
 
     Returns:
         Finished episodes by number, and those to play next, by task, tracker and mode; where none are left the folder

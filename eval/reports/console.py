@@ -9,10 +9,10 @@ from arena_newton.eval.folders.results import Results, RunRecord
 from arena_newton.eval.folders.run_folder import BREAK_FILE, setting
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports import report
 from arena_newton.eval.reports.progress import duration, simulated
 from arena_newton.eval.statistics import stats
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["announce", "broken", "environment", "failed", "result"]

@@ -115,9 +115,9 @@ def notes(run: RunRecord, results: Results) -> list[str]:
         )
     late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
     if late:
-        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's look.")
+        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's query.")
     if replan:
-        found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
+        found.append(f"The policy is queried again after {counted(replan, 'action')} of each chunk.")
     if results["config"].get("ensemble"):
         found.append("At each tick the mean of all chunks that cover it is executed.")
     return found + changed_conditions(run)

@@ -80,7 +80,7 @@ class TrainingRecipe:
     """`float32`, or `bfloat16` of autocast (of pi0.5: of the weights)."""
     seed: int = 42
     chunk: int = 20
-    """Actions that are executed without a new look."""
+    """Actions that are executed without a new query."""
     horizon: int = 20
     """Actions that the network predicts."""
     picture: int = 224

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -81,9 +82,9 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
         with _group(device, processes), fast_kernels(device):
             return _train(options, settings, out, device, processes, progress, checkpoint)
     except torch.OutOfMemoryError as error:
-        told = " ".join(str(error).split())[:160]
+        text = " ".join(str(error).split())[:160]
         raise ArenaError(
-            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+            f"{device}: its memory is full ({text}); try a smaller --batch-size, or fewer datasets"
         ) from None
 
 
@@ -257,7 +258,7 @@ def pair_weights(store: FrameStore, options: PolicyTrainOptions) -> list[float] 
     return [weights.get(task, 1.0) for task, _ in store.pairs]
 
 
-def camera_fit(store: FrameStore) -> str:
+def camera_fit(store: FrameStore) -> Literal["pad", "native"]:
     """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
     band = (store.height - store.width * 3 // 4) // 2
     return "pad" if band > 0 and min(store.top, store.bottom) >= BLACK_PART * band else "native"

@@ -53,14 +53,14 @@ class TrainingLog:
 
     def record(self, row: dict[str, float]) -> None:
         """Add a row; a value that is missing or not a number is left empty."""
-        told = {name: value for name, value in row.items() if not math.isnan(value)}
+        facts = {name: value for name, value in row.items() if not math.isnan(value)}
         with self._path.open("a", newline="") as file:
-            file.write(self._text([{name: f"{value:.8g}" for name, value in told.items()}]))
-        for name, value in told.items():
+            file.write(self._text([{name: f"{value:.8g}" for name, value in facts.items()}]))
+        for name, value in facts.items():
             if name != "step":
                 self._curves.add_scalar(f"train/{name}", value, int(row["step"]))
-        shown = {"loss": f"{row['loss']:.4f}"} if "loss" in told else {}
-        if "held_out_loss" in told:
+        shown = {"loss": f"{row['loss']:.4f}"} if "loss" in facts else {}
+        if "held_out_loss" in facts:
             shown["held_out"] = f"{row['held_out_loss']:.4f}"
         self._bar.set_postfix(shown, refresh=False)
 

@@ -17,7 +17,7 @@ from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.eval.play.run import _record
 from arena_newton.eval.records import journal
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, read_journal
-from arena_newton.eval.records.schema import Fit
+from arena_newton.files.stored_json import Fit
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 JOURNALS = Path(__file__).parent / "journals"

@@ -226,12 +226,12 @@ def _check_features(subject: _Subject) -> None:
             )
     protocol = files.info.get("vla_protocol")
     if subject.kind.name == "arena" and (subject.arena is not None or protocol is not None):
-        told = protocol if isinstance(protocol, dict) else {}
-        wanted_protocol = described_protocol(subject.labels, str(told.get("backend_source", "")).split("+"))
+        declared = protocol if isinstance(protocol, dict) else {}
+        wanted_protocol = described_protocol(subject.labels, str(declared.get("backend_source", "")).split("+"))
         keys = list(wanted_protocol) if subject.arena is not None else ["version"]
         for name in keys:
-            if told.get(name) != wanted_protocol[name]:
-                shown = f"is {str(told.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
+            if declared.get(name) != wanted_protocol[name]:
+                shown = f"is {str(declared.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
                 raise DatasetMismatch(subject.info, f"vla_protocol: {name} {shown}")
     if subject.arena is not None:
         if subject.kind.name == "arena" and subject.arena.get("slots") != described_slots(subject.labels):

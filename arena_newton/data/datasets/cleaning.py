@@ -231,8 +231,8 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
         kept |= {index: np.arange(rows), vision(camera, "rgb_video_num_frames"): np.asarray(np.int64(rows))} | changed
     counts = {name: int(broken.sum()) for name, broken in found.items()}
     source = hashlib.sha256(read_bytes(file, MAX_BYTES)).hexdigest()
-    told = {"dropped": int((~stays).sum()), "rules": counts, "source": file.name, "sha256": source}
-    kept["arena_cleaned"] = np.asarray(np.str_(json.dumps(told, sort_keys=True)))
+    facts = {"dropped": int((~stays).sum()), "rules": counts, "source": file.name, "sha256": source}
+    kept["arena_cleaned"] = np.asarray(np.str_(json.dumps(facts, sort_keys=True)))
     kept["arena_source_rows"] = arrays.get("arena_source_rows", np.arange(len(stays)))[stays]
     write_episode(folder / file.name, kept)
     return found, stays

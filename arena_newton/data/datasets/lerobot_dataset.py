@@ -38,7 +38,7 @@ from arena_newton.data.recording.layouts import Layout, described_protocol, desc
 from arena_newton.data.recording.source_videos import SourceVideo, source_looks, source_video
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import new_folder
-from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.own_files import write_json
 from arena_newton.files.text import counted
 from arena_newton.rules import seeding
 
@@ -393,7 +393,7 @@ def _finish(chosen: Chosen, root: Path, *, kind: Layout, labels: str) -> None:
     # Averages of zeros and ones are again zeros and ones up to rounding, which is not wanted here.
     for key, columns in names.items():
         stats[key] = _clean_hands(stats[key], columns)
-    _write_json(meta / "stats.json", stats, sort=True)
+    write_json(meta / "stats.json", stats, sort=True)
     info = read_json(meta / "info.json")
     features = info["features"]
     assert isinstance(features, dict)
@@ -404,8 +404,8 @@ def _finish(chosen: Chosen, root: Path, *, kind: Layout, labels: str) -> None:
         trackers = list(dict.fromkeys(episode.text("arena_tracker") for episode in chosen.episodes))
         info["vla_protocol"] = described_protocol(labels, trackers)
     info["arena"] = _origin(chosen, kind, labels)
-    _write_json(meta / "info.json", info)
-    _write_json(meta / "modality.json", modality(kind, labels, chosen.cameras))
+    write_json(meta / "info.json", info)
+    write_json(meta / "modality.json", modality(kind, labels, chosen.cameras))
     write_looks(root, chosen.looks)
     rights = (meta / "info.json").stat().st_mode & 0o777
     for file in root.rglob("*"):
@@ -455,8 +455,3 @@ def _origin(chosen: Chosen, kind: Layout, labels: str) -> dict[str, object]:
         "configurations": dict(sorted(configurations.items())),
         "episodes": episodes,
     }
-
-
-def _write_json(path: Path, value: object, *, sort: bool = False) -> None:
-    with replace_atomically(path) as file:
-        file.write(json.dumps(value, indent=4, sort_keys=sort, ensure_ascii=False).encode())

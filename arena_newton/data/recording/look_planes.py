@@ -50,7 +50,7 @@ def visual_angle() -> float:
 def second_light(episode_seed: int, number: int) -> LightDraw | float:
     """The second light of an episode with this number: a distant light, or the intensity of a dome."""
     rng = np.random.default_rng([episode_seed, number, KEY])
-    distant, strength, tilt, turn = rng.random(4).tolist()
+    distant, strength, tilt, turn = map(float, rng.random(4))
     if distant >= DISTANT_PROBABILITY:
         return 3000.0 * (DOME[0] + (DOME[1] - DOME[0]) * strength)
     steepest = visual_angle() + APART

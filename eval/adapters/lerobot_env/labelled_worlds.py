@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from arena_newton.data.readers.label_protocols import V4Decoder
+from arena_newton.data.readers.label_decoder import V4Decoder
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.gym import ArenaVectorEnv, Info, Observations
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds
@@ -154,8 +154,8 @@ class V4VectorEnv(PolicyVectorEnv):
         policy = policy or PolicyWorlds(labels="v4")
         if not 0.0 <= policy.realign <= 1.0:
             raise InputError(f"realign {policy.realign}: expected 0 to 1")
-        if policy.look_ticks < 1:
-            raise InputError(f"look_ticks {policy.look_ticks}: expected at least 1")
+        if policy.query_ticks < 1:
+            raise InputError(f"query_ticks {policy.query_ticks}: expected at least 1")
         super().__init__(task, num_envs, policy=policy, episodes=episodes, **options)
         self._decoder = V4Decoder(num_envs, realign=policy.realign)
 
@@ -163,7 +163,7 @@ class V4VectorEnv(PolicyVectorEnv):
         """Decode a tick's actions and advance; see `ArenaVectorEnv.step`."""
         acting = self._acting()
         self._decoder.measure(
-            measured_yaw(torch.from_numpy(self._state)), acting & (self.env.tick % self._policy.look_ticks == 0)
+            measured_yaw(torch.from_numpy(self._state)), acting & (self.env.tick % self._policy.query_ticks == 0)
         )
         decoded = self._decoder.decode(self._checked(actions).cpu()[:, None], acting)[:, 0]
         return super().step(decoded)

@@ -207,8 +207,8 @@ def _whole(kind: type[PreTrainedModel], folder: Path) -> torch.nn.Module:
     finally:
         transformers_logging.set_verbosity(said_before)
     assert isinstance(loaded, tuple)
-    model, said = loaded
-    missing = sorted({*said["missing_keys"], *(one[0] for one in said.get("mismatched_keys", ()))})
+    model, text = loaded
+    missing = sorted({*text["missing_keys"], *(one[0] for one in text.get("mismatched_keys", ()))})
     if missing:
         raise InputError(
             f"{folder}: weights of CLIP are incomplete, {missing[0]} and {len(missing) - 1} others are not there"

@@ -208,10 +208,10 @@ def load_base(policy: PreTrainedPolicy, path: Path) -> str:
     own = policy.state_dict()
     missing, left = sorted(set(own) - set(found)), sorted(set(found) - set(own))
     if missing or left:
-        said = [
+        lines = [
             f"{len(names)} {what}, {names[0]}" for names, what in ((missing, "missing"), (left, "unknown")) if names
         ]
-        raise InputError(f"{path}: not the weights of this policy ({'; '.join(said)})")
+        raise InputError(f"{path}: not the weights of this policy ({'; '.join(lines)})")
     ready: dict[str, torch.Tensor] = {}
     for name, tensor in own.items():
         given = found[name].to(tensor.dtype)

@@ -13,9 +13,7 @@ import json
 import mmap
 import os
 import selectors
-import signal
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +28,7 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.interrupts import Uninterrupted
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended, start_module
 from arena_newton.files.pinned_memory import pin, unpin
 from arena_newton.policies.train.frames.decoder_process import SLOTS, EpisodeDecoder, chunk, mapped
 
@@ -157,20 +155,10 @@ class DecoderPool:
         variables = environment(one_thread=True)
         for number in range(count):
             facts = self._fd, number, self._slot, height, width
-            command = [sys.executable, "-P", "-m", PROGRAM, *map(str, facts)]
             with self._whole:
                 try:
                     slots = mapped(self._fd, number, self._slot)
-                    # A session of its own: Ctrl-C is the training's, which ends its processes itself.
-                    process = subprocess.Popen(
-                        command,
-                        pass_fds=(self._fd,),
-                        env=variables,
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.PIPE,
-                        bufsize=0,
-                        start_new_session=True,
-                    )
+                    process = start_module(PROGRAM, *facts, files=[self._fd], variables=variables, pipes=True)
                 except OSError:  # the user's limit of processes, or of memory: those that there are decode
                     break
                 self._workers.append(_Worker(process, slots))
@@ -291,7 +279,9 @@ class DecoderPool:
         part = os.read(worker.process.stdout.fileno(), 1 << 16)
         if not part:
             where = f"{films[worker.film]}: " if worker.film >= 0 else ""
-            raise ArenaError(f"{where}the process that decodes pictures ended ({_how(worker.process)})")
+            raise ArenaError(
+                f"{where}the process that decodes pictures ended ({how_it_ended(worker.process, DEATH_PATIENCE)})"
+            )
         worker.received += part
         *lines, rest = worker.received.split(b"\n")
         worker.received = bytearray(rest)
@@ -331,15 +321,3 @@ def _tell(worker: _Worker, message: dict[str, object]) -> None:
     assert worker.process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
         worker.process.stdin.write(json.dumps(message).encode() + b"\n")
-
-
-def _how(process: subprocess.Popen[bytes]) -> str:
-    """Ending of a process, in words."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(DEATH_PATIENCE)
-    code = process.returncode
-    if code is None:
-        return "it closed its output"
-    if code >= 0:
-        return f"exit code {code}"
-    return f"{signal.Signals(-code).name}{'; out of memory?' if -code == signal.SIGKILL else ''}"

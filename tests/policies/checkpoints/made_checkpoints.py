@@ -152,13 +152,13 @@ def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="
     )
 
 
-def follow(policy, seeds, looks, *, asks=None, side=(SIDE, SIDE)):
-    """Actions of each world by seed, tick by tick, over `looks` answers of full length.
+def follow(policy, seeds, queries, *, asks=None, side=(SIDE, SIDE)):
+    """Actions of each world by seed, tick by tick, over `queries` answers of full length.
 
     Args:
         policy: Is reset.
         seeds: Episode seeds of the worlds.
-        looks: Ticks that are played are `looks` times the policy's chunk.
+        queries: Ticks that are played are `queries` times the policy's chunk.
         asks: World → tick at which its episode begins, so that worlds ask at different ticks.
         side: Height and width of pictures.
     """
@@ -167,7 +167,7 @@ def follow(policy, seeds, looks, *, asks=None, side=(SIDE, SIDE)):
     policy.reset(seeds, ["boxing"] * worlds)
     ticks, left = [0] * worlds, [[] for _ in range(worlds)]
     played = [[] for _ in range(worlds)]
-    total = looks * policy.chunk_size
+    total = queries * policy.chunk_size
     for now in range(total + max(begins)):
         acting = [now >= begin and ticks[w] < total for w, begin in enumerate(begins)]
         mask = [acting[w] and not left[w] for w in range(worlds)]

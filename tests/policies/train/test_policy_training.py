@@ -35,10 +35,11 @@ from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
-from arena_newton.policies.train.frames.frame_store import load_frames, made_frames
+from arena_newton.policies.train.frames.frame_store import load_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import train
+from benchmarks.made_frames import made_frames
 from tests.children import Child
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network

@@ -1,21 +1,22 @@
-"""Flags of the command that plays one checkpoint through every door."""
+"""Flags of the command that plays one checkpoint through every protocol."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["DOOR_NAMES", "DoorOptions"]
+__all__ = ["PROTOCOLS", "ProtocolOptions"]
 
-DOOR_NAMES = ("lerobot", "learned", "lerobot-eval", "openpi", "roboarena", "vla-eval", "arena")
-"""Doors: two of our runner, LeRobot's own command line, and the protocols of `policies.serve`."""
+PROTOCOLS = ("lerobot", "learned", "lerobot-eval", "openpi", "roboarena", "vla-eval", "arena")
+"""Names of the programs that are compared: two of our runner, LeRobot's own command line, the protocols of
+`policies.serve`."""
 
 
 @dataclass(frozen=True)
-class DoorOptions:
-    """Play the same episodes with one checkpoint through each door, and compare outcomes, steps and actions.
+class ProtocolOptions:
+    """Play the same episodes with one checkpoint through each protocol, and compare outcomes, steps and actions.
 
-    The first door is what the others are compared with. On engine mujoco and the CPU every door but `learned`, whose
-    forward pass is another program, promises the same bits. Exit code 0: what is promised holds; 1: it does not.
+    The others are compared with the first protocol. On engine mujoco and the CPU every protocol but `learned`, whose
+    forward pass is another program, promises the same bits. Exit code 0: the promise holds; 1: it does not.
     """
 
     checkpoint: str | None = None
@@ -26,8 +27,8 @@ class DoorOptions:
     """Tracker that executes actions."""
     episodes: int = 3
     """Episodes of group seed 0, repeats 0, 1, 2 ..., 20 at most."""
-    doors: tuple[str, ...] = DOOR_NAMES
-    """Doors, in order."""
+    protocols: tuple[str, ...] = PROTOCOLS
+    """Protocols, in order."""
     first: int = 40
     """Actions of each episode that are compared bit for bit."""
     max_steps: int | None = None
@@ -36,5 +37,5 @@ class DoorOptions:
     """Physics engine: mujoco or warp."""
     device: str = "cpu"
     """Device of worlds and networks: cpu, cuda."""
-    out: str = "doors"
+    out: str = "protocols"
     """Folder of the episodes, the programs' output and the table; must be empty or new."""

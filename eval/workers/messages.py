@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from arena_newton.errors import InputError
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import StorageError
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "Slice", "Ticks", "broke"]
+__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "EpisodeBatch", "Ticks", "broke"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Opened:
 
 
 @dataclass(frozen=True)
-class Slice:
+class EpisodeBatch:
     """Episodes of one task, tracker and mode that a process plays."""
 
     group: str
@@ -56,7 +56,7 @@ class Slice:
 
 @dataclass(frozen=True)
 class Built:
-    """The environment of a slice is built."""
+    """The environment of a batch is built."""
 
     facts: JsonObject
     """The policy's or tracker's own description."""
@@ -79,12 +79,12 @@ class Ended:
 
 @dataclass(frozen=True)
 class Done:
-    """The process of a slice has reported all that it played, and waits."""
+    """The process of a batch has reported all that it played, and waits."""
 
 
 @dataclass(frozen=True)
 class Broke:
-    """A slice ended early, or a process could not begin."""
+    """A batch ended early, or a process could not begin."""
 
     kind: str
     """`input` and `storage` stop the run as such errors; `stop` stops it; of `broken` another attempt is made."""

@@ -1,4 +1,4 @@
-"""A slice of a plan in a process that does not own the journal: what happens is told as events."""
+"""A batch of episodes in a process that does not own the journal: it sends events."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_parts
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.progress import kernels_to_compile
-from arena_newton.eval.workers.slice_events import Broke, Built, Ended, Event, Slice, Ticks, broke
+from arena_newton.eval.workers.messages import Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.policies.base import Policy
 
 __all__ = ["device_name", "parts", "play"]
 
 TICKS_EVERY = 1.0
-"""Ticks are told so often [s]."""
+"""Ticks are sent so often [s]."""
 SHARED_WITHIN = 10.0
 """A shared folder shows a new file to another machine within this time [s]."""
 COMPILE_LOCK = "arena_newton.lock"
@@ -44,7 +44,7 @@ def parts(options: RunOptions, factories: Factories | None) -> tuple[RunConfig, 
 
     Args:
         options: Resolved flags.
-        factories: The real parts by default, with environments that last from one slice to the next.
+        factories: The real parts by default, with environments that last from one batch to the next.
     """
     quiet_warp()
     made_of = factories or Factories(env=EnvCache())
@@ -52,22 +52,22 @@ def parts(options: RunOptions, factories: Factories | None) -> tuple[RunConfig, 
 
 
 def play(
-    part: Slice,
+    part: EpisodeBatch,
     config: RunConfig,
     path: Path,
     factories: Factories,
     policy: Policy,
-    tell: Callable[[Event], None],
+    send: Callable[[Event], None],
 ) -> None:
-    """Play the episodes of a slice.
+    """Play the episodes of a batch.
 
     Args:
-        part: What to play.
+        part: Episodes to play.
         config: The run, with all its episodes.
         path: Its results folder.
         factories: What environments are built with.
         policy: The policy.
-        tell: Takes what happens.
+        send: Takes events.
 
     Raises:
         InputError: The folder is not that of the run: files would not be where the journal says.
@@ -81,15 +81,15 @@ def play(
     config = dataclasses.replace(config, flags=flags, episodes=tuple(episodes))
     if flags.video or flags.strip or flags.record or flags.actions or flags.viewer_failures:
         _check_shared(path)
-    folder = _SliceFolder(path, config, part.config_hash, tell)
+    folder = _BatchFolder(path, config, part.config_hash, send)
     with contextlib.ExitStack() as compiling:
         compiling.enter_context(_alone_while_compiling(flags.engine, config.device))
-        player = _SlicePlayer(config, folder, _Lines(tell), factories, policy, batch=part.worlds)
-        player.progress = _Told(tell, compiling.close)
+        player = _BatchPlayer(config, folder, _Lines(send), factories, policy, batch=part.worlds)
+        player.progress = _Counts(send, compiling.close)
         try:
             player.play_group(part.group, list(episodes))
         except RunStopped as error:
-            tell(folder.broke or broke(error))
+            send(folder.broke or broke(error))
 
 
 def device_name(device: str) -> str:
@@ -124,60 +124,60 @@ def _alone_while_compiling(engine: str, device: str) -> Iterator[None]:
         yield
 
 
-class _SliceFolder(ResultsFolder):
+class _BatchFolder(ResultsFolder):
     """The results folder in a process that writes only files of episodes into it."""
 
-    def __init__(self, path: Path, config: RunConfig, config_hash: str, tell: Callable[[Event], None]):
+    def __init__(self, path: Path, config: RunConfig, config_hash: str, send: Callable[[Event], None]):
         super().__init__(path, config, versions())
         self.document: Document = {"config_hash": config_hash}  # type: ignore[typeddict-item]  # all that is asked for
-        self._tell = tell
+        self._send = send
         self.broke: Broke | None = None
         """The last break."""
 
     def register(self, group: str, facts: Mapping[str, object]) -> JsonObject:
-        """Tell what an environment says of itself."""
+        """Send the description of an environment."""
         plain = plain_facts(facts)
-        self._tell(Built(plain))
+        self._send(Built(plain))
         return plain
 
     def keep_trace(self) -> None:
-        """Keep what broke, to be told."""
+        """Keep the error, to be sent."""
         error = sys.exception()
         if error is not None:
             self.broke = broke(error)
 
 
-class _SlicePlayer(RunPlayer):
-    """Plays a slice, and does not know the journal."""
+class _BatchPlayer(RunPlayer):
+    """Plays a batch without the journal."""
 
     def kept(self) -> str:
         return "episodes that have ended are kept"
 
 
 class _Lines:
-    """Tells of episodes that ended."""
+    """Sends lines of episodes that ended."""
 
-    def __init__(self, tell: Callable[[Event], None]):
+    def __init__(self, send: Callable[[Event], None]):
         self.records: list[EpisodeRecord] = []
-        self._tell = tell
+        self._send = send
 
     def append(self, record: EpisodeRecord) -> None:
-        self._tell(Ended(record.to_json()))
+        self._send(Ended(record.to_json()))
 
 
-class _Told:
-    """Tells of ticks now and then."""
+class _Counts:
+    """Sends counts of ticks."""
 
-    def __init__(self, tell: Callable[[Event], None], first: Callable[[], None]):
+    def __init__(self, send: Callable[[Event], None], first: Callable[[], None]):
         """`first` is called when the first tick is over, after which no kernel is compiled."""
-        self._tell, self._first = tell, first
+        self._send, self._first = send, first
         self._count, self._at = 0, time.monotonic()
 
     def tick(self, active: int) -> None:
         self._first()
         self._count += active
         if time.monotonic() - self._at >= TICKS_EVERY:
-            self._tell(Ticks(self._count))
+            self._send(Ticks(self._count))
             self._count, self._at = 0, time.monotonic()
 
     def episode(self, budget: int, used: int) -> None:
@@ -187,4 +187,4 @@ class _Told:
         """The driver plans."""
 
     def say(self, text: str) -> None:
-        """A node has nobody who looks on."""
+        """A node has no terminal."""

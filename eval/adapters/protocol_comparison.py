@@ -1,7 +1,7 @@
-"""``python -m arena_newton.eval doors``: one checkpoint through our runner, `lerobot-eval` and every served protocol.
+"""``python -m arena_newton.eval protocols``: one checkpoint by our runner, `lerobot-eval` and every served protocol.
 
-Each door is a program of its own, called as a user calls it; its command is in the table's file. What it did is read
-from what it wrote: outcome and steps of each episode, and the actions that were executed.
+Each protocol is a program of its own, called as a user calls it; its command is in the table's file. Outcome, steps and
+executed actions of each episode are read from the files that it wrote.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from arena_newton import tasks
 from arena_newton.cli.extras import require
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
-from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
+from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
@@ -36,12 +36,12 @@ from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
 from arena_newton.robot.canonical import ACTION_WIDTH
 
-__all__ = ["DoorEpisode", "DoorPlay", "DoorRow", "compare_doors", "door_table", "run"]
+__all__ = ["ProtocolEpisode", "ProtocolRun", "ProtocolRow", "compare_protocols", "protocol_table", "run"]
 
 SERVED = ("openpi", "roboarena", "vla-eval", "arena")
-"""Doors behind a server."""
-SAME_BITS = tuple(name for name in DOOR_NAMES if name != "learned")
-"""Doors that promise the bits of `lerobot` on engine mujoco and the CPU."""
+"""Protocols behind a server."""
+SAME_BITS = tuple(name for name in PROTOCOLS if name != "learned")
+"""Protocols that promise the bits of `lerobot` on engine mujoco and the CPU."""
 START_S = 300.0
 """Longest wait until a server listens [s]."""
 END_S = 30.0
@@ -51,7 +51,7 @@ ADDRESS = "eval asks it by --policy "
 
 
 @dataclass(frozen=True)
-class DoorEpisode:
+class ProtocolEpisode:
     """Result of an episode."""
 
     key: str
@@ -66,11 +66,11 @@ class DoorEpisode:
 
 
 @dataclass(frozen=True)
-class DoorPlay:
+class ProtocolRun:
     """Result of a protocol's program."""
 
-    door: str
-    episodes: tuple[DoorEpisode, ...]
+    protocol: str
+    episodes: tuple[ProtocolEpisode, ...]
     seconds: float
     """From its start to its end [s]."""
     commands: tuple[str, ...] = ()
@@ -78,16 +78,16 @@ class DoorPlay:
 
 
 @dataclass(frozen=True)
-class DoorRow:
-    """A door next to the first one."""
+class ProtocolRow:
+    """A protocol compared with the first one."""
 
-    door: str
+    protocol: str
     successes: int
     episodes: int
     steps: tuple[int, ...]
     """Of each episode."""
     same_endings: bool
-    """Outcome, reason and steps of every episode are those of the first door."""
+    """Outcome, reason and steps of every episode are those of the first protocol."""
     same_actions: bool
     """The first actions of every episode are, bit for bit."""
     same_everything: bool
@@ -107,19 +107,19 @@ class DoorRow:
         return not self.promised or (self.same_endings and self.same_everything)
 
 
-def run(options: DoorOptions) -> int:
-    """Play, print the table, and write doors.json and doors.md.
+def run(options: ProtocolOptions) -> int:
+    """Play, print the table, and write protocols.json and protocols.md.
 
     Returns:
         Exit code: 0 what is promised holds, 1 it does not.
 
     Raises:
-        InputError: A flag is wrong, or a door's program failed.
+        InputError: A flag is wrong, or a protocol's program failed.
         StorageError: A file cannot be written.
     """
     checkpoint = SHIPPED if options.checkpoint is None else user_path(options.checkpoint)
     checkpoint = checkpoint_folder(checkpoint, "--checkpoint")
-    doors = _checked(options, checkpoint)
+    protocols = _checked(options, checkpoint)
     out = user_path(options.out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: is not an empty folder")
@@ -128,49 +128,52 @@ def run(options: DoorOptions) -> int:
     except OSError as error:
         raise StorageError(f"--out {out}: cannot be made ({error.strerror})") from None
     plays = []
-    for door in doors:
-        plays.append(_play(door, options, checkpoint, out / door))
+    for protocol in protocols:
+        plays.append(_play(protocol, options, checkpoint, out / protocol))
         play = plays[-1]
         solved = sum(episode.outcome == "success" for episode in play.episodes)
-        print(f"{door}: {solved} of {len(play.episodes)}, {play.seconds:.0f} s", flush=True)
+        print(f"{protocol}: {solved} of {len(play.episodes)}, {play.seconds:.0f} s", flush=True)
     promised = SAME_BITS if (options.engine, options.device) == ("mujoco", "cpu") else ()
-    rows = compare_doors(plays, options.first, promised)
-    said = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
-    text = door_table(rows, options.first)
-    commands = "\n".join(f"- {row.door}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
-    write_atomic(out / "doors.md", f"{said}\n\n{text}\n{commands}\n")
-    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": [asdict(row) for row in rows]}
-    write_atomic(out / "doors.json", json.dumps(facts, indent=2) + "\n")
-    print(f"\n{said}\n\n{text}")
-    broken = [row.door for row in rows if not row.kept]
+    rows = compare_protocols(plays, options.first, promised)
+    message = f"{checkpoint}, {options.task} through {options.tracker}, engine {options.engine}, {options.device}"
+    text = protocol_table(rows, options.first)
+    commands = "\n".join(f"- {row.protocol}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
+    write_atomic(out / "protocols.md", f"{message}\n\n{text}\n{commands}\n")
+    # Keys of a stored file do not follow the name of the command.
+    compared = [{"door": row.protocol, **asdict(row)} for row in rows]
+    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": compared}
+    write_atomic(out / "protocols.json", json.dumps(facts, indent=2) + "\n")
+    print(f"\n{message}\n\n{text}")
+    broken = [row.protocol for row in rows if not row.kept]
     print(f"differs, but must not: {' '.join(broken)}" if broken else "what is promised holds")
-    print(f"written: {out / 'doors.md'} and doors.json")
+    print(f"written: {out / 'protocols.md'} and protocols.json")
     return 1 if broken else 0
 
 
-def compare_doors(plays: Sequence[DoorPlay], first: int, promised: Sequence[str]) -> list[DoorRow]:
-    """Compare each door with the first one.
+def compare_protocols(plays: Sequence[ProtocolRun], first: int, promised: Sequence[str]) -> list[ProtocolRow]:
+    """Compare each protocol with the first one.
 
     Args:
-        plays: What the doors did, over the same episodes in the same order.
+        plays: Results of the protocols, over the same episodes in the same order.
         first: Actions of each episode that count as its beginning.
-        promised: Doors that must be the same; a first door that is not one of them promises nothing for the others.
+        promised: Protocols that must be the same; a first one that is not among them promises nothing for the others.
 
     Raises:
-        InputError: A door played other episodes than the first one.
+        InputError: A protocol played other episodes than the first one.
     """
     against = plays[0]
     rows = []
     for play in plays:
         keys, wanted = ([episode.key for episode in one.episodes] for one in (play, against))
         if keys != wanted:
-            raise InputError(f"door {play.door}: played {' '.join(keys)}, door {against.door} {' '.join(wanted)}")
+            others = f"{against.protocol} {' '.join(wanted)}"
+            raise InputError(f"protocol {play.protocol}: played {' '.join(keys)}, protocol {others}")
         pairs = list(zip(play.episodes, against.episodes, strict=True))
         parts = [tick for ours, theirs in pairs if (tick := _parts_at(ours.actions, theirs.actions)) is not None]
         begun = [(ours.actions[:first], theirs.actions[:first]) for ours, theirs in pairs]
         rows.append(
-            DoorRow(
-                door=play.door,
+            ProtocolRow(
+                protocol=play.protocol,
                 successes=sum(episode.outcome == "success" for episode in play.episodes),
                 episodes=len(play.episodes),
                 steps=tuple(episode.steps for episode in play.episodes),
@@ -179,7 +182,7 @@ def compare_doors(plays: Sequence[DoorPlay], first: int, promised: Sequence[str]
                 same_everything=not parts and all(a.margin == b.margin for a, b in pairs),
                 largest=max((_largest(a, b) for a, b in begun), default=0.0),
                 parts_at=min(parts, default=None),
-                promised=play.door in promised and against.door in promised,
+                promised=play.protocol in promised and against.protocol in promised,
                 seconds=play.seconds,
                 commands=play.commands,
             )
@@ -187,16 +190,16 @@ def compare_doors(plays: Sequence[DoorPlay], first: int, promised: Sequence[str]
     return rows
 
 
-def door_table(rows: Sequence[DoorRow], first: int) -> str:
+def protocol_table(rows: Sequence[ProtocolRow], first: int) -> str:
     """The comparison as a table in Markdown."""
-    head = ("door", "successes", "steps", f"first {first} actions", "largest difference", "all actions, margins")
+    head = ("protocol", "successes", "steps", f"first {first} actions", "largest difference", "all actions, margins")
     lines = []
     for row in rows:
         actions, all_of_it = ("same bits" if same else "differ" for same in (row.same_actions, row.same_everything))
         steps = " ".join(str(number) for number in row.steps)
         parts = "–" if row.parts_at is None else str(row.parts_at)
         won = f"{row.successes} of {row.episodes}"
-        lines.append((f"`{row.door}`", won, steps, actions, f"{row.largest:.1e}", all_of_it, parts))
+        lines.append((f"`{row.protocol}`", won, steps, actions, f"{row.largest:.1e}", all_of_it, parts))
     return "\n".join(Table((*head, "first difference at tick"), lines, "lrllrlr").compact()) + "\n"
 
 
@@ -214,61 +217,63 @@ def _largest(ours: np.ndarray, theirs: np.ndarray) -> float:
     return float(np.abs(ours[:common] - theirs[:common]).max()) if common else 0.0
 
 
-def _checked(options: DoorOptions, checkpoint: Path) -> tuple[str, ...]:
-    """The doors that can be played, once the flags are checked."""
+def _checked(options: ProtocolOptions, checkpoint: Path) -> tuple[str, ...]:
+    """The protocols that can be played, once the flags are checked."""
     tasks.get(options.task)
-    for name in options.doors:
-        if name not in DOOR_NAMES:
-            raise InputError(f"--doors {name}: unknown, choose from {' '.join(DOOR_NAMES)}")
-    if not options.doors or len(set(options.doors)) != len(options.doors):
-        raise InputError("--doors: name at least one, each once")
+    for name in options.protocols:
+        if name not in PROTOCOLS:
+            raise InputError(f"--protocols {name}: unknown, choose from {' '.join(PROTOCOLS)}")
+    if not options.protocols or len(set(options.protocols)) != len(options.protocols):
+        raise InputError("--protocols: name at least one, each once")
     if not 1 <= options.episodes <= PROTOCOL_REPEATS:
         raise InputError(f"--episodes {options.episodes}: expected 1 to {PROTOCOL_REPEATS}")
     for name, value in (("first", options.first), ("max-steps", options.max_steps)):
         if value is not None and value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
-    if set(options.doors) & set(SERVED):
-        require("serve", "eval doors")
-    if "lerobot-eval" in options.doors:
-        require("data", "eval doors --doors lerobot-eval")
+    if set(options.protocols) & set(SERVED):
+        require("serve", "eval protocols")
+    if "lerobot-eval" in options.protocols:
+        require("data", "eval protocols --protocols lerobot-eval")
         if importlib.util.find_spec("lerobot") is None:
-            raise InputError("eval doors --doors lerobot-eval: LeRobot is not installed")
-    doors = options.doors
-    if "learned" in doors and not (checkpoint / CARD_FILE).is_file():
+            raise InputError("eval protocols --protocols lerobot-eval: LeRobot is not installed")
+    protocols = options.protocols
+    if "learned" in protocols and not (checkpoint / CARD_FILE).is_file():
         print(f"learned: left out, {checkpoint} is not packed (holds no {CARD_FILE})")
-        doors = tuple(name for name in doors if name != "learned")
-    if not doors:
-        raise InputError("--doors: none is left")
-    return doors
+        protocols = tuple(name for name in protocols if name != "learned")
+    if not protocols:
+        raise InputError("--protocols: none is left")
+    return protocols
 
 
-def _play(door: str, options: DoorOptions, checkpoint: Path, folder: Path) -> DoorPlay:
-    """Play the episodes through a door."""
+def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Path) -> ProtocolRun:
+    """Play the episodes through a protocol."""
     folder.mkdir()
     began = time.perf_counter()
-    if door == "lerobot-eval":
+    if protocol == "lerobot-eval":
         commands, found = [_stock_command(options, checkpoint, folder)], folder
-        _call(door, commands[0], folder / "output.txt", (0,))
-        endings = _stock_endings(door, folder, options)
+        _call(protocol, commands[0], folder / "output.txt", (0,))
+        endings = _stock_endings(protocol, folder, options)
     else:
         commands, found = [], folder / "run"
         with contextlib.ExitStack() as stack:
-            spec = f"{door}:{checkpoint}"
-            if door in SERVED:
-                served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", door]
+            spec = f"{protocol}:{checkpoint}"
+            if protocol in SERVED:
+                served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", protocol]
                 served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
                 served += ["--device", options.device]
                 commands.append([sys.executable, "-m", *served])
-                spec = stack.enter_context(_server(door, commands[0], folder / "server.txt"))
+                spec = stack.enter_context(_server(protocol, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))
-            _call(door, commands[-1], folder / "output.txt", (0, 1))
+            _call(protocol, commands[-1], folder / "output.txt", (0, 1))
         endings = _run_endings(found)
     seconds = time.perf_counter() - began
     episodes = []
     for key, (outcome, reason, steps, margin) in endings.items():
         path = found / "actions" / f"{options.task}_base_{key.replace('/', '_')}.npz"
-        episodes.append(DoorEpisode(key, outcome, reason, steps, margin, _actions(path)))
-    return DoorPlay(door, tuple(episodes), seconds, tuple(shlex.join(["python", *line[1:]]) for line in commands))
+        episodes.append(ProtocolEpisode(key, outcome, reason, steps, margin, _actions(path)))
+    return ProtocolRun(
+        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[1:]]) for line in commands)
+    )
 
 
 def _actions(path: Path) -> np.ndarray:
@@ -279,7 +284,7 @@ def _actions(path: Path) -> np.ndarray:
         return np.ascontiguousarray(file["action"], np.float32)
 
 
-def _run_command(options: DoorOptions, spec: str, folder: Path) -> list[str]:
+def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]:
     """Our runner."""
     line = [sys.executable, "-m", "arena_newton.eval", "run", "--task", options.task, "--tracker", options.tracker]
     line += ["--policy", spec, "--seeds", "0", "--repeats", str(options.episodes), "--worlds", str(options.episodes)]
@@ -287,7 +292,7 @@ def _run_command(options: DoorOptions, spec: str, folder: Path) -> list[str]:
     return line if options.max_steps is None else [*line, "--max-steps", str(options.max_steps)]
 
 
-def _stock_command(options: DoorOptions, checkpoint: Path, folder: Path) -> list[str]:
+def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> list[str]:
     """LeRobot's own command line: one world a batch, so that each forward pass has one row as on our CPU."""
     line = [sys.executable, "-m", "lerobot.scripts.lerobot_eval"]
     line += ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
@@ -298,33 +303,34 @@ def _stock_command(options: DoorOptions, checkpoint: Path, folder: Path) -> list
     return line if options.max_steps is None else [*line, f"--env.episode_length={options.max_steps}"]
 
 
-def _call(door: str, command: Sequence[str], log: Path, allowed: Sequence[int]) -> None:
+def _call(protocol: str, command: Sequence[str], log: Path, allowed: Sequence[int]) -> None:
     """Run a program, whose output goes into a file."""
     with log.open("w") as file:
         done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, env=environment(one_thread=True))
     if done.returncode not in allowed:
-        raise InputError(f"door {door}: exit code {done.returncode}, {_last_line(log)}; all of it is in {log}")
+        why = f"exit code {done.returncode}, {_last_line(log)}"
+        raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
 
 
 def _last_line(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return lines[-1][:300] if lines else "it said nothing"
+    return lines[-1][:300] if lines else "it printed nothing"
 
 
 @contextlib.contextmanager
-def _server(door: str, command: Sequence[str], log: Path) -> Iterator[str]:
+def _server(protocol: str, command: Sequence[str], log: Path) -> Iterator[str]:
     """A server that listens; gives the policy by which it is asked."""
     with log.open("w") as errors:
         made = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(one_thread=True)
         )
-    said: list[str] = []
+    lines: list[str] = []
     listens = threading.Event()
 
     def read() -> None:
         assert made.stdout is not None
         for line in made.stdout:
-            said.append(line.rstrip("\n"))
+            lines.append(line.rstrip("\n"))
             if line.startswith(ADDRESS):
                 listens.set()
         listens.set()
@@ -333,9 +339,10 @@ def _server(door: str, command: Sequence[str], log: Path) -> Iterator[str]:
     reader.start()
     try:
         listens.wait(START_S)
-        found = [line.removeprefix(ADDRESS) for line in said if line.startswith(ADDRESS)]
+        found = [line.removeprefix(ADDRESS) for line in lines if line.startswith(ADDRESS)]
         if not found:
-            raise InputError(f"door {door}: its server does not listen, {_last_line(log)}; all of it is in {log}")
+            why = f"its server does not listen, {_last_line(log)}"
+            raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
         yield found[0]
     finally:
         made.send_signal(signal.SIGINT)
@@ -346,7 +353,7 @@ def _server(door: str, command: Sequence[str], log: Path) -> Iterator[str]:
             made.wait()
         reader.join(END_S)
         with contextlib.suppress(OSError), log.open("a") as file:
-            file.write("\n".join(said) + "\n")
+            file.write("\n".join(lines) + "\n")
 
 
 type Ending = tuple[str, str | None, int, float | None]
@@ -360,13 +367,14 @@ def _run_endings(folder: Path) -> Mapping[str, Ending]:
     }
 
 
-def _stock_endings(door: str, folder: Path, options: DoorOptions) -> Mapping[str, Ending]:
+def _stock_endings(protocol: str, folder: Path, options: ProtocolOptions) -> Mapping[str, Ending]:
     """Endings of the episodes that the environment of `lerobot-eval` wrote, checked against LeRobot's own file."""
     lines = [json.loads(line) for line in (folder / OUTCOMES_FILE).read_text().splitlines()]
     info = json.loads((folder / "lerobot" / "eval_info.json").read_text())
     successes = info["per_task"][0]["metrics"]["successes"]
     if [line["outcome"] == "success" for line in lines] != successes or len(lines) != options.episodes:
-        raise InputError(f"door {door}: LeRobot counts {successes} in {folder / 'lerobot'}, {OUTCOMES_FILE} otherwise")
+        where = f"{folder / 'lerobot'}, {OUTCOMES_FILE} otherwise"
+        raise InputError(f"protocol {protocol}: LeRobot counts {successes} in {where}")
     return {
         f"s{line['group_seed']}/r{line['repeat']}": (line["outcome"], line["reason"], line["steps"], line["margin"])
         for line in lines

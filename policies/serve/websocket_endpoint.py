@@ -1,7 +1,7 @@
-"""The doors of openpi, RoboArena and vla-eval: websockets, a thread for each connection, which is a robot or several.
+"""Endpoints of openpi, RoboArena and vla-eval: websockets, a thread for each connection, which is a robot or several.
 
-Next to the socket every door answers `GET /healthz`, `/health` and `/config`. A frame that is no message gets one line
-back and never a traceback.
+Next to the socket every endpoint answers `GET /healthz`, `/health` and `/config`. A frame that is not a message gets
+one line back and never a traceback.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from arena_newton.errors import ArenaError
 from arena_newton.files.text import plain_text
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.arena_codec import pack_config, pack_failure
-from arena_newton.policies.protocols.policy_messages import Begin, End, Look
+from arena_newton.policies.protocols.policy_messages import Begin, End, Query
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, DoorGuard
+from arena_newton.policies.serve.connection_guard import HEALTH_PATHS, ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.websocket_listener import WebsocketListener, dismiss
 
-__all__ = ["WebsocketDoor", "WebsocketProtocol"]
+__all__ = ["WebsocketEndpoint", "WebsocketProtocol"]
 
 type WebsocketProtocol = Literal["openpi", "roboarena", "vla-eval"]
 """Protocol on the connection; `roboarena` is openpi with that benchmark's own metadata and nothing else in it."""
@@ -45,7 +45,7 @@ INTERNAL_ERROR, FULL = 1011, 1013
 """Codes with which a socket is closed: a request failed, as openpi's server does it; too many connections."""
 
 
-class WebsocketDoor:
+class WebsocketEndpoint:
     """Listens, and translates between frames and the policy server."""
 
     def __init__(
@@ -53,14 +53,14 @@ class WebsocketDoor:
         server: PolicyServer,
         listening: socket.socket,
         protocol: WebsocketProtocol,
-        guard: DoorGuard,
+        guard: ConnectionGuard,
         tls: ssl.SSLContext | None = None,
     ):
         """Begin to listen.
 
         Args:
             server: Answers; it has started.
-            listening: The port, which belongs to the door from now on.
+            listening: The port, which belongs to the endpoint from now on.
             protocol: What is spoken.
             guard: Who may come in.
             tls: Certificate and key, for `wss`.
@@ -80,7 +80,7 @@ class WebsocketDoor:
         )
 
     def close(self) -> None:
-        """End the door and its connections."""
+        """End the endpoint and its connections."""
         self._listener.close("the server is closing")
 
     def _answer_http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
@@ -132,7 +132,7 @@ class WebsocketDoor:
                     self._policy.begin(owner, request)
                     connection.send(openpi_codec.RESET_ANSWER)
                     continue
-                answer = self._policy.look(owner, request)
+                answer = self._policy.query(owner, request)
                 frame = openpi_codec.pack_answer(answer.actions, answer.infer_ms, total, roboarena=roboarena)
             except ArenaError as error:  # openpi's server says so in a text frame, too, and closes
                 connection.send(plain_text(error, 300))
@@ -158,7 +158,7 @@ class WebsocketDoor:
                 if message.type in ("error", "record"):
                     continue
                 request = vla_eval_codec.unpack_request(message)
-                if isinstance(request, Look):
+                if isinstance(request, Query):
                     rest = kept.pop(request.session, deque())
                     actions = self._actions(owner, request, rest, whole=whole)
                     if rest:
@@ -173,12 +173,12 @@ class WebsocketDoor:
             except ArenaError as error:
                 connection.send(vla_eval_codec.pack_error(plain_text(error, 300), seq, time.time()))
 
-    def _actions(self, owner: str, look: Look, kept: deque[np.ndarray], *, whole: bool) -> np.ndarray:
+    def _actions(self, owner: str, query: Query, kept: deque[np.ndarray], *, whole: bool) -> np.ndarray:
         """A chunk, or the next action of one, as a robot takes them."""
         if whole:
-            return self._policy.look(owner, look).actions
+            return self._policy.query(owner, query).actions
         if not kept:
-            kept.extend(self._policy.look(owner, look).actions)
+            kept.extend(self._policy.query(owner, query).actions)
         return kept.popleft()
 
 

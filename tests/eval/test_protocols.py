@@ -1,8 +1,9 @@
-"""One checkpoint through its doors: what is compared and refused, and that a stock lerobot-eval plays ours."""
+"""One checkpoint through its protocols: what is compared and refused, and that a stock lerobot-eval plays ours."""
 
 import contextlib
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +17,16 @@ from lerobot.scripts.lerobot_eval import eval_main
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.adapters import door_comparison
-from arena_newton.eval.adapters.door_comparison import DoorEpisode, DoorPlay, compare_doors, door_table
-from arena_newton.eval.adapters.door_options import DOOR_NAMES, DoorOptions
+from arena_newton.eval.adapters import protocol_comparison
 from arena_newton.eval.adapters.lerobot_env import ArenaNewtonEnv
 from arena_newton.eval.adapters.lerobot_env.labelled_worlds import V4VectorEnv
+from arena_newton.eval.adapters.protocol_comparison import (
+    ProtocolEpisode,
+    ProtocolRun,
+    compare_protocols,
+    protocol_table,
+)
+from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.play.run import Factories
 from arena_newton.policies.replay import ReplayEpisodes
 
@@ -34,19 +40,19 @@ PLUGIN = ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env",
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT like the one that ships: v4 with realignment, a task vector, pictures without bars."""
     about = facts(labels="v4", realign=0.05, family="act", task_vector=TASKS, tasks=TASKS, fit="native")
     return save(tmp_path_factory.mktemp("act"), "act", facts=about, spread=0.1)
 
 
-def play(door, *episodes, seconds=1.0):
-    """Episodes of a door, as outcome and actions."""
+def play(protocol, *episodes, seconds=1.0):
+    """Episodes played through a protocol, as outcome and actions."""
     made = [
-        DoorEpisode(f"s0/r{number}", outcome, outcome, len(actions), 0.5, np.asarray(actions, np.float32))
+        ProtocolEpisode(f"s0/r{number}", outcome, outcome, len(actions), 0.5, np.asarray(actions, np.float32))
         for number, (outcome, actions) in enumerate(episodes)
     ]
-    return DoorPlay(door, tuple(made), seconds)
+    return ProtocolRun(protocol, tuple(made), seconds)
 
 
 def test_any_bit_counts():
@@ -59,37 +65,41 @@ def test_any_bit_counts():
     bit = play("arena", ("success", other), ("timeout", actions[:4]))
     ended = play("vla-eval", ("fall", actions[:2]), ("timeout", actions[:4]))
     free = play("learned", ("success", other), ("timeout", actions[:4]))
-    rows = compare_doors([first, same, bit, ended, free], 2, ("lerobot", "openpi", "arena", "vla-eval"))
+    rows = compare_protocols([first, same, bit, ended, free], 2, ("lerobot", "openpi", "arena", "vla-eval"))
     assert [row.kept for row in rows] == [True, True, False, False, True]
     assert [row.parts_at for row in rows] == [None, None, 3, 2, 3]
     assert [row.same_actions for row in rows] == [True] * 5 and not rows[3].same_endings
-    (late,) = compare_doors([first, bit], 4, ())[1:]
+    (late,) = compare_protocols([first, bit], 4, ())[1:]
     assert not late.same_actions and 0.0 < late.largest < 1e-6
-    moved = DoorPlay("openpi", (DoorEpisode("s0/r0", "success", "success", 5, 0.6, actions), same.episodes[1]), 1.0)
-    assert not compare_doors([first, moved], 2, ("lerobot", "openpi"))[1].kept
-    table = door_table(rows, 2)
+    moved = ProtocolRun(
+        "openpi", (ProtocolEpisode("s0/r0", "success", "success", 5, 0.6, actions), same.episodes[1]), 1.0
+    )
+    assert not compare_protocols([first, moved], 2, ("lerobot", "openpi"))[1].kept
+    table = protocol_table(rows, 2)
     assert table.count("\n") == 2 + 5 and "| `arena` | 1 of 2 | 5 4 | same bits |" in table
-    with pytest.raises(InputError, match="door openpi: played s0/r0, door lerobot s0/r0 s0/r1"):
-        compare_doors([first, play("openpi", ("success", actions))], 2, ())
+    with pytest.raises(InputError, match="protocol openpi: played s0/r0, protocol lerobot s0/r0 s0/r1"):
+        compare_protocols([first, play("openpi", ("success", actions))], 2, ())
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"doors": ("openpi", "grpc")}, "--doors grpc: unknown"),
-        ({"doors": ("openpi", "openpi")}, "each once"),
+        ({"protocols": ("openpi", "grpc")}, "--protocols grpc: unknown"),
+        ({"protocols": ("openpi", "openpi")}, "each once"),
         ({"episodes": 21}, "--episodes 21"),
         ({"first": 0}, "--first 0"),
         ({"max_steps": 0}, "--max-steps 0"),
         ({"task": "golf"}, "golf"),
         ({"checkpoint": "/nowhere"}, "--checkpoint:/nowhere: no such folder"),
-        ({"doors": ("learned",)}, "none is left"),
+        ({"protocols": ("learned",)}, "none is left"),
     ],
 )
-def test_wrong_doors_are_refused_first(checkpoint, tmp_path, changes, message):
+def test_wrong_protocols_are_refused_first(checkpoint, tmp_path, changes, message):
     """A flag that does not fit is named before a program starts, and nothing is written."""
     with pytest.raises(InputError, match=re.escape(message)):
-        door_comparison.run(DoorOptions(**{"checkpoint": str(checkpoint), "out": str(tmp_path / "new")} | changes))
+        protocol_comparison.run(
+            ProtocolOptions(**{"checkpoint": str(checkpoint), "out": str(tmp_path / "new")} | changes)
+        )
     assert not (tmp_path / "new").exists()
 
 
@@ -97,13 +107,13 @@ def test_a_folder_that_holds_something_is_left_alone(checkpoint, tmp_path):
     """A folder that is not empty is refused, and keeps what it has."""
     (tmp_path / "mine").write_text("kept")
     with pytest.raises(InputError, match="is not an empty folder"):
-        door_comparison.run(DoorOptions(checkpoint=str(checkpoint), out=str(tmp_path)))
+        protocol_comparison.run(ProtocolOptions(checkpoint=str(checkpoint), out=str(tmp_path)))
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
 @pytest.fixture
 def here(monkeypatch, kept_worlds):
-    """The programs of doors run in this process, by their command lines; gives their exit codes."""
+    """The programs of protocols run in this process, by their command lines; gives their exit codes."""
     codes = []
 
     def call(command, *, stdout, **_):
@@ -112,38 +122,38 @@ def here(monkeypatch, kept_worlds):
             codes.append(main(command[3:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
-    monkeypatch.setattr(door_comparison.subprocess, "run", call)
+    monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
     return codes
 
 
-def test_a_door_that_fails_says_what_its_program_said(checkpoint, tmp_path, here):
+def test_a_protocol_that_fails_names_the_last_line_of_its_program(checkpoint, tmp_path, here):
     """The last line of the program that failed, and where the rest is; a policy that does not know the task."""
-    options = DoorOptions(
-        checkpoint=str(checkpoint), out=str(tmp_path / "out"), doors=("lerobot",), task="football", max_steps=2
+    options = ProtocolOptions(
+        checkpoint=str(checkpoint), out=str(tmp_path / "out"), protocols=("lerobot",), task="football", max_steps=2
     )
     with pytest.raises(
-        InputError, match="door lerobot: exit code 2, .*was trained on boxing, vis_navi, not on football"
+        InputError, match="protocol lerobot: exit code 2, .*was trained on boxing, vis_navi, not on football"
     ):
-        door_comparison.run(options)
+        protocol_comparison.run(options)
     assert here == [2]
 
 
-def test_our_runner_as_a_door(checkpoint, tmp_path, here):
-    """One door alone: what its program did is read from its files."""
+def test_our_runner_alone(checkpoint, tmp_path, here):
+    """One protocol alone: what its program did is read from its files."""
     flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]
-    assert main(["doors", *flags, "--doors", "lerobot", "--out", str(tmp_path / "out")]) == 0
-    (row,) = json.loads((tmp_path / "out" / "doors.json").read_text())["doors"]
+    assert main(["protocols", *flags, "--protocols", "lerobot", "--out", str(tmp_path / "out")]) == 0
+    (row,) = json.loads((tmp_path / "out" / "protocols.json").read_text())["doors"]
     assert row["steps"] == [TICKS] and row["episodes"] == len(here) == 1 and row["promised"]
 
 
-def test_a_door_is_a_program(tmp_path):
+def test_a_protocol_is_a_program(tmp_path):
     """It runs with one thread, what it prints goes into a file, and its exit code counts."""
     program = "import os, sys; print('said', os.environ['MKL_NUM_THREADS'], flush=True); sys.exit('lost')"
     log = tmp_path / "log"
-    door_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0, 1))
+    protocol_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0, 1))
     assert log.read_text() == "said 1\nlost\n"
-    with pytest.raises(InputError, match=f"door openpi: exit code 1, lost; all of it is in {log}"):
-        door_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0,))
+    with pytest.raises(InputError, match=f"protocol openpi: exit code 1, lost; all of it is in {log}"):
+        protocol_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0,))
 
 
 def argv(monkeypatch, checkpoint, *flags):
@@ -153,19 +163,19 @@ def argv(monkeypatch, checkpoint, *flags):
 
 
 def test_the_checkpoint_says_how_it_is_played(checkpoint, monkeypatch, tmp_path):
-    """Labels, picture, task vector and looks are those of `--policy.path`; flags that are given count more."""
+    """Labels, picture, task vector and queries are those of `--policy.path`; flags that are given count more."""
     argv(monkeypatch, checkpoint)
     said = ArenaNewtonEnv(task="boxing").policy_worlds
-    assert (said.labels, said.realign, said.look_ticks, said.task_vector) == ("v4", 0.05, 6, TASKS)
+    assert (said.labels, said.realign, said.query_ticks, said.task_vector) == ("v4", 0.05, 6, TASKS)
     assert (said.width, said.height, said.fit) == (SIDE, SIDE, "native")
     own = ArenaNewtonEnv(task="boxing", fit="pad", realign=0.0, image_width=96, labels="v3.1", task_vector="boxing")
     assert own.policy_worlds.fit == "pad" and own.policy_worlds.realign == 0.0 and own.policy_worlds.labels == "v3.1"
     assert own.features["observation.images.front"].shape == (SIDE, 96, 3) and own.policy_worlds.height == SIDE
     assert own.features["observation.environment_state"].shape == (1,)
     argv(monkeypatch, checkpoint, "--policy.n_action_steps=3")
-    assert ArenaNewtonEnv(task="boxing").policy_worlds.look_ticks == 3
+    assert ArenaNewtonEnv(task="boxing").policy_worlds.query_ticks == 3
     argv(monkeypatch, checkpoint, "--policy.temporal_ensemble_coeff=0.01", "--policy.n_action_steps=1")
-    assert ArenaNewtonEnv(task="boxing").policy_worlds.look_ticks == 1
+    assert ArenaNewtonEnv(task="boxing").policy_worlds.query_ticks == 1
     with pytest.raises(InputError, match="--env.task football: the policy was trained on boxing, vis_navi"):
         ArenaNewtonEnv(task="football")
     argv(monkeypatch, tmp_path)  # none of ours
@@ -248,15 +258,15 @@ def test_the_vector_names_the_task():
 
 
 @pytest.mark.slow
-def test_every_door_gives_the_same_episodes(checkpoint, tmp_path, capsys):
-    """The command itself, each door a program: equal bits, exit code 0, and a table with every command."""
-    doors = [door for door in DOOR_NAMES if door != "learned"]
+def test_every_protocol_gives_the_same_episodes(checkpoint, tmp_path, capsys):
+    """The command itself, each protocol a program: equal bits, exit code 0, and a table with every command."""
+    protocols = [protocol for protocol in PROTOCOLS if protocol != "learned"]
     flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "2", "--max-steps", str(TICKS)]
-    assert main(["doors", *flags, "--doors", *doors, "--out", str(tmp_path / "out")]) == 0
+    assert main(["protocols", *flags, "--protocols", *protocols, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
-    assert said.count("| `") == len(doors) and "what is promised holds" in said and "differ |" not in said
-    written = json.loads((tmp_path / "out" / "doors.json").read_text())
-    assert [row["door"] for row in written["doors"]] == doors
+    assert said.count("| `") == len(protocols) and "what is promised holds" in said and "differ |" not in said
+    written = json.loads((tmp_path / "out" / "protocols.json").read_text())
+    assert [row["door"] for row in written["doors"]] == protocols
     assert all(row["same_everything"] and row["steps"] == [TICKS, TICKS] for row in written["doors"])
-    text = (tmp_path / "out" / "doors.md").read_text()
+    text = (tmp_path / "out" / "protocols.md").read_text()
     assert "lerobot.scripts.lerobot_eval" in text and text.count("policies.serve") == 4

@@ -1,4 +1,4 @@
-"""One checkpoint, a random ACT of v4 whose heading is realigned, through every door: the same episodes as without."""
+"""One checkpoint, a random ACT of v4 whose heading is realigned, through each protocol: the same episodes as alone."""
 
 import sys
 from pathlib import Path
@@ -15,9 +15,9 @@ from arena_newton.env import ArenaEnv
 from arena_newton.policies import Observation
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.protocols.handshake import ServedPicture
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import make_policy, open_door
+from arena_newton.policies.serve.serve_command import make_policy, open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.rollout import Rollout
 
@@ -58,7 +58,7 @@ class Gr00tCheckpoint(Gr00tServer):
         state = np.concatenate([seen["state"][name] for name in MODALITIES["state"]["modality_keys"]], axis=-1)[:, 0]
         tasks = [options["task"]] * len(state)
         self.policy.reset(options["seed"], tasks)
-        looks = Observation(
+        queries = Observation(
             torch.from_numpy(state.copy()),
             torch.from_numpy(seen["video"]["ego_view"][:, 0].copy()),
             np.ones(len(state), bool),
@@ -66,23 +66,23 @@ class Gr00tCheckpoint(Gr00tServer):
             options["task"],
             "Strike.",
         )
-        chunk = np.asarray(self.policy.act(looks).actions, np.float32)
+        chunk = np.asarray(self.policy.act(queries).actions, np.float32)
         return [{name: chunk[..., part] for name, part in V4.items()}, {}]
 
 
-def started(door, checkpoint):
+def started(name, checkpoint):
     """The address of a server of the checkpoint, and how to end it."""
-    if door == "gr00t":
+    if name == "gr00t":
         policy = policies.get(f"lerobot:{checkpoint}")
         policy.check()
         server = Gr00tCheckpoint(policy)
         return server.url, server.close
-    protocol, _, raw = door.partition(" ")
+    protocol, _, raw = name.partition(" ")
     options = ServeOptions(policy=f"lerobot:{checkpoint}", protocol=protocol, port=0, raw_labels=bool(raw))
     device = torch.device("cpu")
     server = PolicyServer(make_policy(options, device), max_batch_size=8, max_wait=0.01, max_sessions=16, device=device)
     server.start("boxing")
-    opened = open_door(server, options, DoorGuard(16))
+    opened = open_endpoint(server, options, ConnectionGuard(16))
 
     def close():
         opened.close()
@@ -91,15 +91,15 @@ def started(door, checkpoint):
     return f"{'http' if protocol == 'arena' else protocol}://127.0.0.1:{opened.port}", close
 
 
-def test_one_checkpoint_through_every_door(checkpoint):
+def test_one_checkpoint_through_every_protocol(checkpoint):
     """Outcome, ticks and margin of every episode are those of `lerobot:`, decoded by the server or by the robot."""
     env, ends = None, {}
-    for door in ("", "arena", "openpi", "openpi raw", "roboarena", "vla-eval", "vla-eval raw", "gr00t"):
-        url, close = started(door, checkpoint) if door else ("", lambda: None)
-        policy = policies.get(f"remote:{url}", timeout=30.0) if door else policies.get(f"lerobot:{checkpoint}")
+    for name in ("", "arena", "openpi", "openpi raw", "roboarena", "vla-eval", "vla-eval raw", "gr00t"):
+        url, close = started(name, checkpoint) if name else ("", lambda: None)
+        policy = policies.get(f"remote:{url}", timeout=30.0) if name else policies.get(f"lerobot:{checkpoint}")
         policy.check()
-        if door:
-            raw = "raw" in door or door == "gr00t"
+        if name:
+            raw = "raw" in name or name == "gr00t"
             assert (policy.labels, policy.realign) == (("v4", REALIGN) if raw else ("v3.1", 0.0))
         env = env or ArenaEnv(
             "boxing", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", camera=policy.camera
@@ -115,10 +115,10 @@ def test_one_checkpoint_through_every_door(checkpoint):
 
         reader.act = watched
         results = Rollout(env, reader, [SimpleNamespace(episode_seed=s) for s in SEEDS], max_steps=TICKS).run()
-        ends[door] = {r.episode.episode_seed: (r.outcome, r.steps, r.margin, r.error) for r in results}, played
+        ends[name] = {r.episode.episode_seed: (r.outcome, r.steps, r.margin, r.error) for r in results}, played
         policy.close()
         close()
     wanted = ends.pop("")
     assert len(wanted[0]) == len(SEEDS) and all(error is None for *_, error in wanted[0].values())
-    assert {door for door, found in ends.items() if found[0] != wanted[0]} == set()
-    assert {door for door, found in ends.items() if found[1] != wanted[1]} == set()
+    assert {name for name, found in ends.items() if found[0] != wanted[0]} == set()
+    assert {name for name, found in ends.items() if found[1] != wanted[1]} == set()

@@ -1,4 +1,4 @@
-"""The doors: each protocol as its clients speak it, who is let in, and what hostile or slow clients can do."""
+"""Endpoints: each protocol as its clients speak it, who is let in, and what hostile or slow clients can do."""
 
 import http.client
 import json
@@ -9,7 +9,7 @@ import time
 import msgpack
 import numpy as np
 import pytest
-from served_policies import Fails, Remembers, TurnsV4, look, state, together
+from served_policies import Fails, Remembers, TurnsV4, query, state, together
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from arena_newton.policies.label_reader import read_by
@@ -27,7 +27,7 @@ VALUES = [0.1, 0.2, 0.3]
 def expected(served, seed):
     """The chunks of an episode as the server object gives them."""
     served.server.begin("direct", Begin("", seed, "boxing"))
-    chunks = [served.server.look("direct", look(v, seed=seed, step=4 * i)).actions for i, v in enumerate(VALUES)]
+    chunks = [served.server.query("direct", query(v, seed=seed, step=4 * i)).actions for i, v in enumerate(VALUES)]
     served.server.leave("direct")
     return chunks
 
@@ -49,13 +49,13 @@ def heard(socket):
 
 
 def test_openpi(served):
-    """Openpi's client is sent the metadata, and each look its chunk; seed and step 0 begin an episode."""
+    """Openpi's client is sent the metadata, and each query its chunk; seed and step 0 begin an episode."""
     one = served(Remembers())
     with one.socket() as client:
         facts, frame = openpi_codec.unpack_metadata(client.recv(timeout=10), "server")
         assert facts == one.server.facts and facts.chunk_length == 4 and frame["action_space"] == "arena_v3.1"
         for seed in (3, 4, 3):
-            chunks = [ask(client, look(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
+            chunks = [ask(client, query(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
             assert np.array_equal(chunks, expected(one, seed))
 
 
@@ -88,13 +88,13 @@ def test_roboarena(served):
             assert client.recv(timeout=10) == "reset successful"
         for i, value in enumerate(VALUES):
             for session, seed in (("a", 3), ("b", 4)):
-                seen = look(value, seed=seed, step=4 * i, session=session)
+                seen = query(value, seed=seed, step=4 * i, session=session)
                 chunks[session].append(ask(client, seen, roboarena=True, image_key="observation/exterior_image_1_left"))
     assert np.array_equal(chunks["a"], expected(one, 3)) and np.array_equal(chunks["b"], expected(one, 4))
 
 
 def test_vla_eval(served):
-    """A robot that says it knows chunks is given whole ones; an error answers its look and the connection goes on."""
+    """A robot that says it knows chunks is given whole ones; an error answers its query and the connection goes on."""
     one = served(Remembers(), "vla-eval")
     with one.socket() as client:
         client.send(vla_eval_codec.pack_hello(None, 1, 0.0))
@@ -104,34 +104,34 @@ def test_vla_eval(served):
             say(client, Begin("", seed, "boxing"))
             got = []
             for i, value in enumerate(VALUES):
-                say(client, look(value, seed=seed, step=4 * i), seq=10 + i)
+                say(client, query(value, seed=seed, step=4 * i), seq=10 + i)
                 got.append(vla_eval_codec.unpack_action(heard(client), 10 + i, "server"))
             assert np.array_equal(got, expected(one, seed))
             say(client, End())
-        say(client, look(seed=3, step=8), seq=77)
+        say(client, query(seed=3, step=8), seq=77)
         error = heard(client)
         assert error.type == "error" and error.seq == 77 and "does not know" in error.payload["error"]
         client.send(b"\xff\xff")
         assert heard(client).type == "error"
-        say(client, look(seed=3, step=0), seq=78)
+        say(client, query(seed=3, step=0), seq=78)
         assert heard(client).type == "action"
 
 
-def test_vla_eval_harness_takes_one_action_a_look(served):
-    """A robot that does not know chunks is given one action of 40 numbers a look, and a new chunk after the last."""
+def test_vla_eval_harness_takes_one_action_a_query(served):
+    """A robot that does not know chunks is given one action of 40 numbers a query, and a new chunk after the last."""
     one = served(Remembers(), "vla-eval")
     with one.socket() as client:
         say(client, Begin("", 3, "boxing"))
         actions = []
         for i in range(8):
-            say(client, look(VALUES[i // 4]), seq=i)
+            say(client, query(VALUES[i // 4]), seq=i)
             actions.append(heard(client).payload["actions"])
         assert actions[0].shape == (40,)
         assert np.array_equal(np.reshape(actions, (2, 4, 40)), expected(one, 3)[:2])
-        say(client, look(VALUES[2]), seq=9)
+        say(client, query(VALUES[2]), seq=9)
         heard(client)
         say(client, Begin("", 4, "boxing"))  # what is left of the chunk is not the new episode's
-        say(client, look(VALUES[0]), seq=1)
+        say(client, query(VALUES[0]), seq=1)
         assert np.array_equal(heard(client).payload["actions"], expected(one, 4)[0][0])
 
 
@@ -148,13 +148,13 @@ def test_arena(served):
         assert status == 200 and reply == {"ok": True, "seeded": True, "policy": one.server.facts.policy}
     for i, value in enumerate(VALUES):
         for world, seed in ((0, 3), (1, 4)):
-            body = arena_codec.pack_look(look(value, seed=seed, step=4 * i, session=str(world)))
+            body = arena_codec.pack_query(query(value, seed=seed, step=4 * i, session=str(world)))
             status, reply = post(one, "/infer", body)
             assert status == 200 and reply["chunk_size"] == 4
             chunks[world].append(np.float32(reply["action_chunk"]))
     assert np.array_equal(chunks[0], expected(one, 3)) and np.array_equal(chunks[1], expected(one, 4))
     assert arena_codec.read_facts(one.http("GET", "/config")[1], "server") == one.server.facts
-    status, reply = post(one, "/infer", arena_codec.pack_look(look(seed=9, step=4, session="0")))
+    status, reply = post(one, "/infer", arena_codec.pack_query(query(seed=9, step=4, session="0")))
     assert status == 409 and "does not know" in reply["error"]
 
 
@@ -178,7 +178,7 @@ def test_two_evaluations_at_one_address(served):
     got = {3: [], 4: []}
     for i, value in enumerate(VALUES):
         for seed in (3, 4):
-            reply = post(one, "/infer", arena_codec.pack_look(look(value, seed=seed, step=4 * i, session="0")))[1]
+            reply = post(one, "/infer", arena_codec.pack_query(query(value, seed=seed, step=4 * i, session="0")))[1]
             got[seed].append(np.float32(reply["action_chunk"]))
     assert np.array_equal(got[3], expected(one, 3)) and np.array_equal(got[4], expected(one, 4))
 
@@ -202,7 +202,7 @@ class Robot:
     def begin(self, seed):
         assert self.ask("/reset", {"seed": seed})[0] == 200
 
-    def look(self, value):
+    def query(self, value):
         seen = {"observation": {"state": [float(v) for v in state(value)]}, "task": "boxing"}
         status, reply = self.ask("/infer", {**seen, "return_chunk": self.chunk})
         assert status == 200, reply
@@ -214,7 +214,7 @@ class Robot:
     "clients",
     [
         pytest.param([{}, {}], id="each keeps its connection"),
-        pytest.param([{"chunk": False}, {"chunk": False}], id="one action a look"),
+        pytest.param([{"chunk": False}, {"chunk": False}], id="one action a query"),
         pytest.param([{"world": 0, "seed": 3}, {"world": 0, "seed": 3}], id="the same world and seed"),
         pytest.param([{"name": "a", "keeps": False}, {"name": "b", "keeps": False}], id="named, over any connection"),
         pytest.param(
@@ -224,7 +224,7 @@ class Robot:
     ],
 )
 def test_two_clients_at_one_address_in_lockstep(served, clients, labels):
-    """Two clients whose looks alternate have two memories: each is given, bit for bit, what it is given alone."""
+    """Two clients whose queries alternate have two memories: each is given, bit for bit, what it is given alone."""
     values = [[0.1, -0.7, 0.3, 0.9, 0.2, -0.4], [0.8, 0.5, -0.6, 0.4, -0.3, 0.7]]
 
     def played(*chosen):
@@ -236,7 +236,7 @@ def test_two_clients_at_one_address_in_lockstep(served, clients, labels):
         got = [[] for _ in robots]
         for turn in range(6):
             for robot, of, number in zip(robots, got, chosen, strict=True):
-                of.append(robot.look(values[number][turn]))
+                of.append(robot.query(values[number][turn]))
         return got
 
     first, second = played(0, 1)
@@ -258,9 +258,9 @@ def test_a_client_goes_on_over_another_connection(served):
     one = served(Remembers(), "arena")
     robot = Robot(one.port)
     robot.begin(3)
-    got = [robot.look(VALUES[0])]
+    got = [robot.query(VALUES[0])]
     robot.connection.close()
-    got += [robot.look(value) for value in VALUES[1:]]
+    got += [robot.query(value) for value in VALUES[1:]]
     assert np.array_equal(got, expected(one, 3))
     pool = [Robot(one.port, world=0, seed=5) for _ in range(3)]
     for client in pool[:2]:
@@ -274,7 +274,7 @@ def test_a_client_with_several_connections(served):
     one = served(Remembers(), "arena")
     first, other = (Robot(one.port, world=0, seed=3) for _ in range(2))
     first.begin(3)
-    got = [client.look(value) for client, value in zip([first, other, first, other], VALUES, strict=False)]
+    got = [client.query(value) for client, value in zip([first, other, first, other], VALUES, strict=False)]
     assert np.array_equal(got, expected(one, 3)[: len(got)])
 
 
@@ -298,12 +298,12 @@ def test_a_client_that_left_gives_its_rows_away(served, monkeypatch):
     deadline = time.monotonic() + 10
     while coming.ask("/reset", {"seed": 5})[0] == 503:
         assert time.monotonic() < deadline
-    assert np.array_equal([staying.look(value) for value in VALUES], expected(served(Remembers()), 3))
+    assert np.array_equal([staying.query(value) for value in VALUES], expected(served(Remembers()), 3))
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])
 def test_routes(served, protocol):
-    """Every door answers /healthz, /health and /config; a browser and another route get nothing."""
+    """Every endpoint answers /healthz, /health and /config; a browser and another route get nothing."""
     one = served(Remembers(), protocol)
     assert one.http("GET", "/healthz") == (200, b"OK\n")
     assert one.http("GET", "/health") == (200, {"status": "ok"})
@@ -374,9 +374,9 @@ def test_errors_are_one_line(served, protocol):
     one = served(Fails(), protocol)
 
     def told(kind, **more):
-        seen = look(kind=kind, step=0, **more)
+        seen = query(kind=kind, step=0, **more)
         if protocol == "arena":
-            status, reply = post(one, "/infer", arena_codec.pack_look(seen))
+            status, reply = post(one, "/infer", arena_codec.pack_query(seen))
             assert status == (500 if kind else 400)
             return reply["error"]
         with one.socket() as client:
@@ -403,7 +403,7 @@ def test_a_session_that_closes_frees_its_row(served):
     for number in range(6):
         client = one.socket()
         client.recv(timeout=10)
-        ask(client, look(seed=1, step=0))
+        ask(client, query(seed=1, step=0))
         if number % 2:
             client.close()
         else:
@@ -419,14 +419,14 @@ def test_a_session_that_closes_frees_its_row(served):
 def test_a_slow_client_holds_up_nobody(served):
     """Clients that send a request by drips, never read, or stop in the middle do not delay another one's answers."""
     one = served(Remembers(), "arena", connections=16)
-    body = arena_codec.pack_look(look(seed=1, step=0, image=np.zeros((480, 640, 3), np.uint8)))
+    body = arena_codec.pack_query(query(seed=1, step=0, image=np.zeros((480, 640, 3), np.uint8)))
     head = b"POST /infer HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n" % len(body)
     slow = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(6)]
     for n, connection in enumerate(slow):
         connection.sendall((head + body)[: 10 + 40 * n])
     began = time.monotonic()
     for i in range(5):
-        assert post(one, "/infer", arena_codec.pack_look(look(seed=1, step=0, session=str(i))))[0] == 200
+        assert post(one, "/infer", arena_codec.pack_query(query(seed=1, step=0, session=str(i))))[0] == 200
     assert time.monotonic() - began < 5.0
     for connection in slow:
         connection.close()
@@ -435,9 +435,9 @@ def test_a_slow_client_holds_up_nobody(served):
     deaf = two.socket(max_queue=1)
     with two.socket() as client:
         for _ in range(300):
-            deaf.send(openpi_codec.pack_request(look(seed=1, step=0)))  # and never reads
+            deaf.send(openpi_codec.pack_request(query(seed=1, step=0)))  # and never reads
         client.recv(timeout=10)
-        assert ask(client, look(seed=2, step=0)).shape == (4, 40)
+        assert ask(client, query(seed=2, step=0)).shape == (4, 40)
     for connection in silent:
         connection.close()
     deaf.socket.close()
@@ -487,7 +487,7 @@ def test_many_robots_at_once(served):
     def play(seed):
         with one.socket() as client:
             client.recv(timeout=10)
-            return [ask(client, look(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
+            return [ask(client, query(v, seed=seed, step=4 * i)) for i, v in enumerate(VALUES)]
 
     results = together(*[lambda seed=seed: play(seed) for seed in range(8)])
     assert max(one.server.counts.batches) >= 4, one.server.counts.batches
@@ -506,7 +506,7 @@ def test_too_large_a_frame(served):
                 client.send(bytes(17 * 2**20))
                 client.recv(timeout=10)
             assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
-        assert ask(other, look(seed=2, step=0)).shape == (4, 40)
+        assert ask(other, query(seed=2, step=0)).shape == (4, 40)
 
 
 def test_closing_ends_the_connections(served):
@@ -548,7 +548,7 @@ def test_a_closing_http_server_hangs_up(served):
         kept.request("GET", "/config")
         kept.getresponse()
     with pytest.raises(Refused, match="^the server is closing$") as caught:
-        one.server.look("a", look(step=0))
+        one.server.query("a", query(step=0))
     assert caught.value.reason == "closing"
 
 
@@ -578,14 +578,14 @@ def test_an_error_of_our_own_is_on_the_console(served, protocol, capfd, monkeypa
     def broken(*_, **__):
         raise ZeroDivisionError("inside the server")
 
-    monkeypatch.setattr(one.server, "look", broken)
+    monkeypatch.setattr(one.server, "query", broken)
     if protocol == "arena":
         with pytest.raises((OSError, http.client.HTTPException)):
-            one.http("POST", "/infer", arena_codec.pack_look(look(step=0)))
+            one.http("POST", "/infer", arena_codec.pack_query(query(step=0)))
     else:
         with one.socket() as client:
             client.recv(timeout=10)
-            client.send(openpi_codec.pack_request(look(step=0)))
+            client.send(openpi_codec.pack_request(query(step=0)))
             with pytest.raises(ConnectionClosed) as closed:
                 client.recv(timeout=10)
             assert "inside the server" not in str(closed.value)

@@ -1,6 +1,6 @@
 """Films that processes encode: Python's global lock lets the threads of one process encode little more than one film.
 
-Each process is started as a program (`film_process`), so that a script that records needs no guard around its main
+Each process is started as a program (`encoder_process`), so that a script that records needs no guard around its main
 part. Pictures reach it through memory that both map, and a message per tick, camera and process says which film each
 belongs to; so a tick costs its recorder as little with a thousand worlds as with one.
 """
@@ -13,10 +13,8 @@ import itertools
 import os
 import select
 import selectors
-import signal
 import socket
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,27 +24,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from arena_newton.data.recording.encoder_process import SlotMemory, packed, unpacked
 from arena_newton.data.recording.encoding import (
     Encoders,
-    Filming,
     Finished,
     Job,
     Pictured,
-    Reel,
+    VideoEncoder,
+    VideoStream,
     copy_pictures,
     slots_of,
 )
 from arena_newton.data.recording.episode_film import FilmFacts
-from arena_newton.data.recording.film_process import SlotMemory, packed, unpacked
 from arena_newton.errors import ArenaError
 from arena_newton.files.interrupts import Uninterrupted
 from arena_newton.files.own_files import PARTIAL
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended, start_module
 from arena_newton.files.pinned_memory import pin, unpin
 
-__all__ = ["FilmPool"]
+__all__ = ["EncoderPool"]
 
-PROGRAM = "arena_newton.data.recording.film_process"
+PROGRAM = "arena_newton.data.recording.encoder_process"
 """Module that each process runs."""
 PATIENCE = 1.0
 """Time after which whoever waits for a process looks at all of them again [s]."""
@@ -80,9 +78,9 @@ class _Slots:
         self.depths = [torch.from_numpy(depths) for depths in memory.depths or ()]
         self.users: list[set[int]] = [set() for _ in range(slots)]
         """Processes that have not read a slot yet."""
-        self.reels: Sequence[Reel] = ()
+        self.streams: Sequence[VideoStream] = ()
         self.messages: dict[int, list[tuple[_Worker, bytes]]] = {}
-        """Messages about each slot, valid as long as the films are `reels`."""
+        """Messages about each slot, valid as long as the films are `streams`."""
         self._whole = torch.from_numpy(np.ndarray((memory.size,), np.uint8, memory.memory))
         self._pinned = device.type == "cuda" and pin(self._whole, device)
         """Into memory that is not pinned a GPU copies too, and whoever asks it waits."""
@@ -109,7 +107,7 @@ class _Slots:
 class _Ending:
     """An episode whose films are being finished or dropped."""
 
-    reels: Mapping[str, Reel]
+    streams: Mapping[str, VideoStream]
     then: Callable[[Mapping[str, FilmFacts | None] | None], None]
     missing: set[int]
     """Films whose process has not answered."""
@@ -117,7 +115,7 @@ class _Ending:
     whole: bool = True
 
 
-class FilmPool(Filming):
+class EncoderPool(VideoEncoder):
     """Films that processes make; threads of this process do what follows, with the files."""
 
     def __init__(self, processes: int, threads: int):
@@ -147,15 +145,8 @@ class FilmPool(Filming):
         ours, theirs = socket.socketpair()
         with theirs:
             files = theirs.fileno(), *(slots.fd for slots in self._cameras.values())
-            # A session of its own: Ctrl-C is the recorder's, which still needs the films.
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", PROGRAM, str(theirs.fileno()), str(os.getpid())],
-                pass_fds=files,
-                env=environment(one_thread=True),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                start_new_session=True,
-            )
+            variables = environment(one_thread=True)
+            process = start_module(PROGRAM, theirs.fileno(), os.getpid(), files=files, variables=variables)
         ours.setblocking(False)
         worker = _Worker(number, process, ours)
         self._selector.register(ours, selectors.EVENT_READ, worker)
@@ -172,23 +163,25 @@ class FilmPool(Filming):
         """The episode brings no more pictures."""
         self._open[worker] -= 1
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> Reel:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
         """A film of an episode."""
-        reel = Reel(next(self._numbers), worker, video, depth)
-        about = {"film": reel.number, "video": str(video), "depth": str(depth), "fps": float(fps)}
+        stream = VideoStream(next(self._numbers), worker, video, depth)
+        about = {"film": stream.number, "video": str(video), "depth": str(depth), "fps": float(fps)}
         about |= {"lossless": lossless}
         with self._whole:
             self._send(self._workers[worker], about)
-        return reel
+        return stream
 
-    def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
+    def add(
+        self, camera: str, streams: Sequence[VideoStream], pictures: torch.Tensor, depths: torch.Tensor | None
+    ) -> None:
         """Append a picture to each film; waits while all slots are taken."""
         slots = self._cameras[camera]
         slot = self._free(slots)
         with self._whole:
             event = slots.fill(slot, pictures, depths)
-            if slots.reels is not reels:
-                slots.reels, slots.messages = reels, {}
+            if slots.streams is not streams:
+                slots.streams, slots.messages = streams, {}
             if slot not in slots.messages:
                 slots.messages[slot] = self._messages(slots, slot)
             messages = slots.messages[slot]
@@ -208,28 +201,28 @@ class FilmPool(Filming):
     def _messages(self, slots: _Slots, slot: int) -> list[tuple[_Worker, bytes]]:
         """Message to each process about the pictures in a slot."""
         rows: dict[int, list[tuple[int, int]]] = {}
-        for row, reel in enumerate(slots.reels):
-            rows.setdefault(reel.worker, []).append((reel.number, row))
+        for row, stream in enumerate(slots.streams):
+            rows.setdefault(stream.worker, []).append((stream.number, row))
         about = {"camera": slots.number, "slot": slot}
         return [(self._workers[number], packed(about | {"rows": theirs})) for number, theirs in rows.items()]
 
-    def finish(self, worker: int, reels: Mapping[str, Reel], then: Finished) -> None:
+    def finish(self, worker: int, streams: Mapping[str, VideoStream], then: Finished) -> None:
         """Finish an episode's films, and then do that, in a thread."""
-        self._end(worker, reels, then, "close")
+        self._end(worker, streams, then, "close")
 
-    def discard(self, worker: int, reels: Mapping[str, Reel], then: Job) -> None:
+    def discard(self, worker: int, streams: Mapping[str, VideoStream], then: Job) -> None:
         """Drop an episode's films, and then do that, in a thread."""
-        self._end(worker, reels, lambda _: then(), "discard")
+        self._end(worker, streams, lambda _: then(), "discard")
 
-    def _end(self, number: int, reels: Mapping[str, Reel], then: Finished, what: str) -> None:
-        worker, ending = self._workers[number], _Ending(reels, then, {reel.number for reel in reels.values()})
+    def _end(self, number: int, streams: Mapping[str, VideoStream], then: Finished, what: str) -> None:
+        worker, ending = self._workers[number], _Ending(streams, then, {stream.number for stream in streams.values()})
         with self._whole:
-            for reel in reels.values():
-                self._endings[reel.number] = ending
+            for stream in streams.values():
+                self._endings[stream.number] = ending
                 if worker.alive:
-                    self._send(worker, {what: reel.number})
+                    self._send(worker, {what: stream.number})
                 else:
-                    self._answered(reel.number, None, whole=False)
+                    self._answered(stream.number, None, whole=False)
 
     def _answered(self, number: int, facts: FilmFacts | None, *, whole: bool) -> None:
         """A film is finished or gone; the last one of an episode leads to what follows."""
@@ -239,12 +232,12 @@ class FilmPool(Filming):
         ending.whole &= whole
         if ending.missing:
             return
-        films = {name: ending.facts[reel.number] for name, reel in ending.reels.items()}
+        films = {name: ending.facts[stream.number] for name, stream in ending.streams.items()}
         if not ending.whole:
-            for reel in ending.reels.values():
-                made = [reel.video] if ending.facts[reel.number] is not None else []
+            for stream in ending.streams.values():
+                made = [stream.video] if ending.facts[stream.number] is not None else []
                 # What a process that is gone has left, too.
-                for path in (*made, reel.depth, reel.video.with_name(reel.video.name + PARTIAL)):
+                for path in (*made, stream.depth, stream.video.with_name(stream.video.name + PARTIAL)):
                     with contextlib.suppress(OSError):
                         path.unlink()
         self._writers.submit(next(self._turns), partial(ending.then, films if ending.whole else None))
@@ -321,7 +314,7 @@ class FilmPool(Filming):
                 self._ended(worker)
 
     def _receive(self, patience: float) -> None:
-        """Read what processes have said, waiting for the first of it so long [s]."""
+        """Read messages of processes, waiting for the first so long [s]."""
         for key, _ in self._selector.select(patience):
             with self._whole:
                 self._read(key.data)
@@ -360,19 +353,13 @@ class FilmPool(Filming):
             return
         worker.alive = False
         self._selector.unregister(worker.connection)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            worker.process.wait(PATIENCE)
-        code = worker.process.returncode or 0
-        how = f"exit code {code}"
-        if code < 0:
-            how = f"{signal.Signals(-code).name}{'; out of memory?' if -code == signal.SIGKILL else ''}"
-        reason = f"a process that encodes pictures ended ({how})"
+        reason = f"a process that encodes pictures ended ({how_it_ended(worker.process, PATIENCE)})"
         self._errors.append(ChildProcessError(errno.ECHILD, reason))
         for slots in self._cameras.values():
             for users in slots.users:
                 users.discard(worker.number)
         for number, ending in list(self._endings.items()):
-            if any(reel.number == number and reel.worker == worker.number for reel in ending.reels.values()):
+            if any(stream.number == number and stream.worker == worker.number for stream in ending.streams.values()):
                 self._answered(number, None, whole=False)
 
 

@@ -1,4 +1,4 @@
-"""``python -m arena_newton.data.recording.film_process``: a process that encodes films for a recorder.
+"""``python -m arena_newton.data.recording.encoder_process``: a process that encodes films for a recorder.
 
 The recorder writes pictures into memory that both map and says over a socket which film each belongs to. The process
 answers when it has read the pictures of a message, when a film is finished, and when one could not be written. It ends

@@ -1,4 +1,4 @@
-"""Hostile, deaf and half-open clients do nothing to the doors that another client notices."""
+"""Hostile, deaf and half-open clients do nothing to the endpoints that another client notices."""
 
 import base64
 import json
@@ -16,12 +16,12 @@ from contextlib import ExitStack, suppress
 import msgpack
 import numpy as np
 import pytest
-from served_policies import Remembers, look, state, together
+from served_policies import Remembers, query, state, together
 
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
-from arena_newton.policies.protocols.arena_codec import unpack_look
+from arena_newton.policies.protocols.arena_codec import unpack_query
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.serve import door_guard, message_readers, websocket_listener
+from arena_newton.policies.serve import connection_guard, message_readers, websocket_listener
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -42,8 +42,8 @@ def plain_socket(port, more=b""):
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "arena"])
-def test_a_connection_that_cannot_be_taken_ends_no_door(served, protocol):
-    """A door whose process has no file descriptors left goes on when there are some again."""
+def test_a_connection_that_cannot_be_taken_ends_no_endpoint(served, protocol):
+    """An endpoint whose process has no file descriptors left goes on when there are some again."""
     one = served(Remembers(), protocol)
     client = socket.socket()
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -54,7 +54,7 @@ def test_a_connection_that_cannot_be_taken_ends_no_door(served, protocol):
                 while True:
                     filled.enter_context(open(os.devnull))
             client.connect(("127.0.0.1", one.port))
-            time.sleep(0.3)
+            time.sleep(0.1)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert one.http("GET", "/healthz") == (200, b"OK\n")
@@ -69,8 +69,8 @@ def talkative():
 
 
 def stuff(connection):
-    """Send looks until neither side's buffer takes any more, and return one."""
-    frame = openpi_codec.pack_request(look(seed=1, step=0))
+    """Send queries until neither side's buffer takes any more, and return one."""
+    frame = openpi_codec.pack_request(query(seed=1, step=0))
     frame = b"\x82\xfe" + struct.pack(">H", len(frame)) + bytes(4) + frame
     connection.settimeout(0.2)
     with suppress(TimeoutError):
@@ -93,13 +93,13 @@ def test_a_client_that_reads_nothing_is_hung_up_on(served, monkeypatch):
 
 
 def test_deaf_clients_do_not_hold_up_the_end(served, monkeypatch):
-    """A door closes at once, however many clients neither answer nor read."""
+    """An endpoint closes at once, however many clients neither answer nor read."""
     monkeypatch.setattr(websocket_listener, "FAREWELL_SECONDS", 0.2)
     one = served(talkative(), connections=8)
     deaf = [plain_socket(one.port)[0] for _ in range(4)]
     stuff(deaf[0])
     began = time.monotonic()
-    one.door.close()
+    one.endpoint.close()
     assert time.monotonic() - began < 4.0
     for client in deaf:
         client.close()
@@ -110,7 +110,7 @@ def test_strangers_take_no_room(served, protocol):
     """Connections that have not shown a token do not count; beyond a number they are closed unread."""
     one = served(Remembers(), protocol, token="abc", connections=2)
     silent = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(10)]
-    time.sleep(0.2)
+    time.sleep(0.05)
     if protocol == "arena":
         with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
             client.sendall(RESET)
@@ -119,7 +119,7 @@ def test_strangers_take_no_room(served, protocol):
         client, status = plain_socket(one.port, b"Authorization: Bearer abc\r\n")
         assert status == 101
         client.close()
-    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(door_guard.STRANGERS)]
+    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(connection_guard.STRANGERS)]
     assert more[-1].recv(1) == b""
     for connection in silent + more:
         connection.close()
@@ -134,7 +134,7 @@ def test_strangers_take_no_room(served, protocol):
 
 def test_a_head_by_drips_is_hung_up_on(served, monkeypatch):
     """A client that sends the first request's head for ever is closed, so that strangers do not gather."""
-    monkeypatch.setattr("arena_newton.policies.serve.http_door.STRANGER_SECONDS", 0.2)
+    monkeypatch.setattr("arena_newton.policies.serve.http_endpoint.STRANGER_SECONDS", 0.2)
     one = served(Remembers(), "arena")
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", one.port), timeout=10) as drips, pytest.raises(OSError, match="."):
@@ -216,7 +216,7 @@ def test_robots_with_the_largest_pictures_are_read_one_by_one(served, monkeypatc
     monkeypatch.setattr(message_readers, "LONGEST_PAUSE", 0.0)
     one = served(Remembers(sees=True), protocol)
     openpi = protocol == "openpi"
-    raw = openpi_codec.pack_request(look(image=np.zeros((*LARGEST[::-1], 3), np.uint8)))
+    raw = openpi_codec.pack_request(query(image=np.zeros((*LARGEST[::-1], 3), np.uint8)))
     frame = raw if openpi else asked_with(front=picture(*LARGEST))
 
     def ask():
@@ -284,7 +284,7 @@ def test_values_of_json_are_counted():
     """A body that would become millions of Python objects is refused before it is read."""
     body = b'{"observation": {"state": [' + b"[]," * 100_000 + b"1]}}"
     with pytest.raises(WireError, match="^/infer: more than 65536 values$"):
-        unpack_look(body)
+        unpack_query(body)
 
 
 def test_one_action_at_a_time(served):

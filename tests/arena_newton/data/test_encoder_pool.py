@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.recording.encoding import FilmThreads, Pictured
-from arena_newton.data.recording.film_pool import FilmPool
+from arena_newton.data.recording.encoder_pool import EncoderPool
+from arena_newton.data.recording.encoding import EncoderThreads, Pictured
 from tests.children import Child
 
 WORLDS, TICKS, SIZE = 5, 14, 64
@@ -27,44 +27,44 @@ def pictures(tick):
     return torch.from_numpy(draw.integers(0, 255, (worlds, SIZE, SIZE, 3), np.uint8)), depths
 
 
-def begin(filming, folder, worlds=WORLDS, depth=True):
+def begin(encoder, folder, worlds=WORLDS, depth=True):
     """Films of some worlds."""
-    filming.bind({"front": Pictured(worlds, SIZE, SIZE, depth)}, CPU)
-    workers = [filming.join() for _ in range(worlds)]
-    return [filming.open(w, folder / f"{n}.mp4", folder / f"{n}.raw", 50) for n, w in enumerate(workers)]
+    encoder.bind({"front": Pictured(worlds, SIZE, SIZE, depth)}, CPU)
+    workers = [encoder.join() for _ in range(worlds)]
+    return [encoder.open(w, folder / f"{n}.mp4", folder / f"{n}.raw", 50) for n, w in enumerate(workers)]
 
 
-def film(filming, folder):
+def film(encoder, folder):
     """Facts of the films of all worlds; the last one has no picture in every other tick."""
     folder.mkdir()
-    reels, facts = begin(filming, folder), {}
-    every = [reels, reels[:-1]]
+    streams, facts = begin(encoder, folder), {}
+    every = [streams, streams[:-1]]
     for tick in range(TICKS):
-        filming.add("front", every[tick % 2], *pictures(tick))
-        filming.check()
-    for number, reel in enumerate(reels):
-        filming.finish(reel.worker, {"front": reel}, lambda films, n=number: facts.update({n: films["front"]}))
-        filming.leave(reel.worker)
-    filming.wait()
-    filming.check()
-    filming.close()
+        encoder.add("front", every[tick % 2], *pictures(tick))
+        encoder.check()
+    for number, stream in enumerate(streams):
+        encoder.finish(stream.worker, {"front": stream}, lambda films, n=number: facts.update({n: films["front"]}))
+        encoder.leave(stream.worker)
+    encoder.wait()
+    encoder.check()
+    encoder.close()
     return facts
 
 
-def dropped(filming, reels):
+def dropped(encoder, streams):
     """Drop films; whether that was said of each."""
     said = []
-    for reel in reels:
-        filming.discard(reel.worker, {"front": reel}, lambda: said.append(1))
-    filming.wait()
-    filming.close()
-    return len(said) == len(reels)
+    for stream in streams:
+        encoder.discard(stream.worker, {"front": stream}, lambda: said.append(1))
+    encoder.wait()
+    encoder.close()
+    return len(said) == len(streams)
 
 
 def test_bytes_are_those_of_threads_and_of_neither(tmp_path):
     """Two processes, two threads and none make the same videos, depths, histograms and numbers of frames."""
-    makers = {"pool": FilmPool(2, 1), "threads": FilmThreads(2), "none": FilmThreads(0)}
-    facts = {name: film(filming, tmp_path / name) for name, filming in makers.items()}
+    makers = {"pool": EncoderPool(2, 1), "threads": EncoderThreads(2), "none": EncoderThreads(0)}
+    facts = {name: film(encoder, tmp_path / name) for name, encoder in makers.items()}
     for name in ("threads", "none"):
         for world in range(WORLDS):
             for ending in ("mp4", "raw"):
@@ -78,13 +78,13 @@ def test_bytes_are_those_of_threads_and_of_neither(tmp_path):
 
 def test_dropped_films_leave_no_file(tmp_path):
     """Films dropped in the middle are gone, and the pool takes other pictures afterwards."""
-    pool = FilmPool(2, 1)
-    reels = begin(pool, tmp_path)
-    pool.add("front", reels, *pictures(0))
+    pool = EncoderPool(2, 1)
+    streams = begin(pool, tmp_path)
+    pool.add("front", streams, *pictures(0))
     pool.wait()
     assert len(list(tmp_path.iterdir())) == 2 * WORLDS
-    for reel in reels:
-        pool.discard(reel.worker, {"front": reel}, lambda: None)
+    for stream in streams:
+        pool.discard(stream.worker, {"front": stream}, lambda: None)
     more = begin(pool, tmp_path, worlds=2, depth=False)
     pool.add("front", more, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
     assert dropped(pool, more) and list(tmp_path.iterdir()) == []
@@ -92,15 +92,15 @@ def test_dropped_films_leave_no_file(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path):
     """The error of a process arrives with number and file; the episode has no films, the others have theirs."""
-    pool = FilmPool(2, 1)
+    pool = EncoderPool(2, 1)
     pool.bind({"front": Pictured(2, SIZE, SIZE, False)}, CPU)
     (tmp_path / "file").touch()
     whole = pool.open(pool.join(), tmp_path / "a.mp4", tmp_path / "a.raw", 50)
     broken = pool.open(pool.join(), tmp_path / "file" / "b.mp4", tmp_path / "b.raw", 50)
     pool.add("front", [whole, broken], torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
     told = {}
-    for reel in (whole, broken):
-        pool.finish(reel.worker, {"front": reel}, lambda films, reel=reel: told.update({reel: films}))
+    for stream in (whole, broken):
+        pool.finish(stream.worker, {"front": stream}, lambda films, stream=stream: told.update({stream: films}))
     pool.wait()
     with pytest.raises(OSError, match=r"file") as caught:
         pool.check()
@@ -120,7 +120,7 @@ def children(parent, wanted):
                 with open(f"/proc/{int(entry)}/stat") as file:
                     status = file.read().rsplit(")", 1)[1].split()
                 with open(f"/proc/{int(entry)}/cmdline") as file:
-                    if int(status[1]) == parent and "film_process" in file.read() and status[0] != "Z":
+                    if int(status[1]) == parent and "encoder_process" in file.read() and status[0] != "Z":
                         found.append(int(entry))
         if len(found) == wanted:
             return found
@@ -130,22 +130,22 @@ def children(parent, wanted):
 
 def test_a_killed_process_is_one_clear_error(tmp_path):
     """The films of a killed process are lost and said to be, those of the others are whole; nothing waits for ever."""
-    pool = FilmPool(2, 1)
-    reels = begin(pool, tmp_path, worlds=2)
-    pool.add("front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half())
+    pool = EncoderPool(2, 1)
+    streams = begin(pool, tmp_path, worlds=2)
+    pool.add("front", streams, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half())
     pool.wait()
     victim = min(children(os.getpid(), 2))  # processes are started in their order
     os.kill(victim, signal.SIGKILL)
     with pytest.raises(ChildProcessError, match=r"a process that encodes pictures ended \(SIGKILL; out of memory\?\)"):
         for _ in range(200):
             pool.add(
-                "front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half()
+                "front", streams, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half()
             )
             pool.check()
             time.sleep(0.01)
     told = []
-    for reel in reels:
-        pool.finish(reel.worker, {"front": reel}, told.append)
+    for stream in streams:
+        pool.finish(stream.worker, {"front": stream}, told.append)
     pool.wait()
     pool.close()
     assert sorted(films is None for films in told) == [False, True]
@@ -154,9 +154,9 @@ def test_a_killed_process_is_one_clear_error(tmp_path):
 
 def half_filmed(arguments):
     """A process that has begun two films."""
-    pool = FilmPool(2, 1)
-    reels = begin(pool, Path(arguments[0]), worlds=2, depth=False)
-    pool.add("front", reels, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
+    pool = EncoderPool(2, 1)
+    streams = begin(pool, Path(arguments[0]), worlds=2, depth=False)
+    pool.add("front", streams, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), None)
     pool.wait()
     print(len(list(Path(arguments[0]).glob("*.part"))), flush=True)
     time.sleep(600)
@@ -180,7 +180,7 @@ def test_no_process_outlives_a_killed_recorder(tmp_path):
 @pytest.mark.parametrize("torn", ["_transmit", "_hear"])
 def test_an_interrupt_tears_no_message(tmp_path, monkeypatch, torn):
     """Ctrl-C in the middle of a message to or from a process: every film is finished, none is waited for in vain."""
-    whole, pending = getattr(FilmPool, torn), []
+    whole, pending = getattr(EncoderPool, torn), []
 
     def interrupted(pool, *about):
         if pending:  # one for each step: the second one in a row comes through at once
@@ -190,14 +190,14 @@ def test_an_interrupt_tears_no_message(tmp_path, monkeypatch, torn):
     def late(number, frame):
         raise TimeoutError("the pool waits for a message that was lost")
 
-    pool, facts, interrupts = FilmPool(2, 1), [], 0
-    reels = begin(pool, tmp_path)
-    monkeypatch.setattr(FilmPool, torn, interrupted)
+    pool, facts, interrupts = EncoderPool(2, 1), [], 0
+    streams = begin(pool, tmp_path)
+    monkeypatch.setattr(EncoderPool, torn, interrupted)
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(60)
     try:
-        steps = [lambda: pool.add("front", reels, *pictures(0))] * 3
-        steps += [lambda r=reel: pool.finish(r.worker, {"front": r}, facts.append) for reel in reels]
+        steps = [lambda: pool.add("front", streams, *pictures(0))] * 3
+        steps += [lambda r=stream: pool.finish(r.worker, {"front": r}, facts.append) for stream in streams]
         for step in [*steps, pool.wait]:
             pending[:] = [signal.SIGINT]
             try:

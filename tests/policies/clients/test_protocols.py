@@ -1,19 +1,18 @@
-"""One policy behind every door: the same actions as in this process, to the last bit."""
+"""One policy behind every protocol: the same actions as in this process, to the last bit."""
 
 import numpy as np
 import pytest
-import torch
 from foreign_servers import SIZE, NoisePolicy, declared_servers, observation
 
 from arena_newton import policies
 from arena_newton.policies import PolicyUnavailable
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.testing import check_policy
 
-DOORS = declared_servers()
+SERVERS = declared_servers()
 OWN = {"arena": "http", "openpi": "openpi", "roboarena": "roboarena", "vla-eval": "vla-eval"}
 """Protocols of this package's own server, and what stands in front of its address."""
 
@@ -22,20 +21,18 @@ class OwnServer:
     """This package's server with the same policy."""
 
     def __init__(self, protocol, port=0):
-        self.server = PolicyServer(
-            NoisePolicy(), max_batch_size=8, max_wait=0.01, max_sessions=16, device=torch.device("cpu")
-        )
+        self.server = PolicyServer(NoisePolicy(), max_batch_size=8, max_wait=0.002, max_sessions=16)
         self.server.start("football")
         options = ServeOptions(policy="stand", protocol=protocol, port=port)
-        self.door = open_door(self.server, options, DoorGuard(16))
-        self.url = f"{OWN[protocol]}://127.0.0.1:{self.door.port}"
+        self.endpoint = open_endpoint(self.server, options, ConnectionGuard(16))
+        self.url = f"{OWN[protocol]}://127.0.0.1:{self.endpoint.port}"
 
     def close(self):
-        self.door.close()
+        self.endpoint.close()
         self.server.close()
 
 
-DOORS |= {f"own {protocol}": lambda protocol=protocol: OwnServer(protocol) for protocol in OWN}
+SERVERS |= {f"own {protocol}": lambda protocol=protocol: OwnServer(protocol) for protocol in OWN}
 
 
 def ask(policy, seeds):
@@ -52,13 +49,13 @@ def ask(policy, seeds):
     return found
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_actions_are_the_same_through_every_door(door):
+@pytest.mark.parametrize("name", SERVERS)
+def test_actions_are_the_same_through_every_protocol(name):
     """Each protocol carries state, picture, seed and step so that the actions are those of the policy itself."""
-    server = DOORS[door]()
+    server = SERVERS[name]()
     policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
     policy.check()
-    if not door.startswith("own"):
+    if not name.startswith("own"):
         assert not policy.depends_on_worlds and policy.describe()["server"].startswith("noise")
     assert (policy.camera.width, policy.camera.height) == (SIZE, SIZE)
     for got, wanted in zip(ask(policy, [5, 6, 7, 8]), ask(NoisePolicy(), [5, 6, 7, 8]), strict=True):
@@ -67,10 +64,10 @@ def test_actions_are_the_same_through_every_door(door):
     server.close()
 
 
-@pytest.mark.parametrize("door", ["own openpi", "own roboarena", "own vla-eval", "own arena", "gr00t"])
-def test_promises_of_a_policy_hold_through_every_door(door):
+@pytest.mark.parametrize("name", ["own openpi", "own roboarena", "own vla-eval", "own arena", "gr00t"])
+def test_promises_of_a_policy_hold_through_every_protocol(name):
     """Seeds, resets, neighbours, broken states: what a policy promises, its client promises too."""
-    server = DOORS[door]()
+    server = SERVERS[name]()
     policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
     assert all(result.ok for result in check_policy(policy))
     policy.close()

@@ -1,4 +1,4 @@
-"""The door of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
+"""Endpoint of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
 
 Which robot a request is of is said by `policies.serve.http_robots`.
 """
@@ -32,15 +32,15 @@ from arena_newton.policies.protocols.arena_codec import (
     pack_failure,
     read_client,
     unpack_begin,
-    unpack_look,
+    unpack_query,
 )
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
-from arena_newton.policies.serve.door_guard import HEALTH_PATHS, STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.connection_guard import HEALTH_PATHS, STRANGER_SECONDS, ConnectionGuard
 from arena_newton.policies.serve.http_robots import HttpRobot, HttpRobots
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
 
-__all__ = ["HttpDoor"]
+__all__ = ["HttpEndpoint"]
 
 IDLE_CONNECTION = 600.0
 """Time without a request after which a connection is closed [s]."""
@@ -50,7 +50,7 @@ DRAIN_SECONDS, DRAIN_FRAMES = 5.0, 4
 """Time [s] and largest bodies' worth of bytes that are read and dropped so that a client whose body is too long, which
 looks for an answer only when it has sent all of it, gets one."""
 POLL = 0.05
-"""Time after which a door notices that it is closed [s]."""
+"""Time after which an endpoint notices that it is closed [s]."""
 _STATUS = {"unfit": 400, "unknown_episode": 409, "full": 503, "policy": 500, "closing": 503}
 """Reason of a refusal → HTTP status; clients ask again after 503."""
 
@@ -90,7 +90,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
 
     def do_POST(self) -> None:  # noqa: N802 (the name that http.server calls)
-        """Begin an episode, or answer a look."""
+        """Begin an episode, or answer a query."""
         path = self.path.partition("?")[0]
         if self._refused(path):
             return
@@ -104,9 +104,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.begin(address, client, self.connection, unpack_begin(body))
                 self._send(200, pack_begun(policy.facts))
             elif path == "/infer":
-                look, chunk = policy.read(len(body), partial(unpack_look, body))
+                query, chunk = policy.read(len(body), partial(unpack_query, body))
                 del body  # its picture is unpacked
-                actions = self.server.look(address, client, self.connection, look, chunk=chunk)
+                actions = self.server.query(address, client, self.connection, query, chunk=chunk)
                 self._send(200, pack_chunk(actions, chunk=chunk))
             else:
                 self._send(404, pack_failure("no such route; there are /reset, /infer, /config, /health"))
@@ -204,7 +204,7 @@ class _Listener(ThreadingHTTPServer):
     request_queue_size, daemon_threads, allow_reuse_address = 128, True, True
 
     def __init__(
-        self, listening: socket.socket, policy: PolicyServer, guard: DoorGuard, tls: ssl.SSLContext | None
+        self, listening: socket.socket, policy: PolicyServer, guard: ConnectionGuard, tls: ssl.SSLContext | None
     ) -> None:
         super().__init__(listening.getsockname()[:2], _Handler, bind_and_activate=False)
         self.socket.close()
@@ -212,7 +212,7 @@ class _Listener(ThreadingHTTPServer):
         self.policy, self.guard, self.tls = policy, guard, tls
         self._robots = HttpRobots()
         self._open: dict[socket.socket, float] = {}
-        """Connection → when it must have said who it is [s]."""
+        """Connection → when it must have identified itself [s]."""
         self._lock = threading.Lock()
 
     def get_request(self) -> tuple[socket.socket, tuple[str, int]]:
@@ -293,44 +293,44 @@ class _Listener(ThreadingHTTPServer):
         self.policy.begin(robot.owner, replace(begin, session=robot.session), held=False)
         robot.kept.clear()
 
-    def look(
-        self, address: str, client: str, connection: socket.socket, look: Look, *, chunk: bool = True
+    def query(
+        self, address: str, client: str, connection: socket.socket, query: Query, *, chunk: bool = True
     ) -> np.ndarray:
         """The chunk of a robot; without `chunk` one action, shape [1, 40]: of its last chunk while some are left."""
-        robot = self._robots.looking(address, client, connection, look.session, look.seed, begins=look.step == 0)
-        if not chunk and look.step is None:
+        robot = self._robots.querying(address, client, connection, query.session, query.seed, begins=query.step == 0)
+        if not chunk and query.step is None:
             with suppress(IndexError):
                 return robot.kept.popleft()[None]
-        return self._asked(robot, look, chunk=chunk)
+        return self._asked(robot, query, chunk=chunk)
 
-    def _asked(self, robot: HttpRobot, look: Look, *, chunk: bool) -> np.ndarray:
-        actions = self.policy.look(robot.owner, replace(look, session=robot.session), held=False).actions
+    def _asked(self, robot: HttpRobot, query: Query, *, chunk: bool) -> np.ndarray:
+        actions = self.policy.query(robot.owner, replace(query, session=robot.session), held=False).actions
         robot.kept = deque() if chunk else deque(actions[1:])
         return actions if chunk else actions[:1]
 
 
-class HttpDoor:
+class HttpEndpoint:
     """Listens, and translates between JSON and the policy server."""
 
     def __init__(
-        self, server: PolicyServer, listening: socket.socket, guard: DoorGuard, tls: ssl.SSLContext | None = None
+        self, server: PolicyServer, listening: socket.socket, guard: ConnectionGuard, tls: ssl.SSLContext | None = None
     ):
         """Begin to listen.
 
         Args:
             server: Answers; it has started.
-            listening: The port, which belongs to the door from now on.
+            listening: The port, which belongs to the endpoint from now on.
             guard: Who may come in.
             tls: Certificate and key, for `https`.
         """
         self.port = int(listening.getsockname()[1])
         listening.listen(_Listener.request_queue_size)
         self._listener = _Listener(listening, server, guard, tls)
-        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="door", daemon=True)
+        self._thread = threading.Thread(target=self._listener.serve_forever, args=[POLL], name="endpoint", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the door and its connections."""
+        """End the endpoint and its connections."""
         with suppress(OSError):  # which wakes who waits for a connection
             self._listener.socket.shutdown(socket.SHUT_RDWR)
         self._listener.shutdown()

@@ -12,12 +12,12 @@ from contextlib import contextmanager
 from arena_newton.errors import InputError
 from arena_newton.policies.protocols.ports import names_this_machine
 
-__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "DoorGuard", "same_token"]
+__all__ = ["ACCESS_TOKEN_VARIABLE", "HEALTH_PATHS", "STRANGER_SECONDS", "ConnectionGuard", "same_token"]
 
 ACCESS_TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that clients must send; the same of which clients take theirs."""
 STRANGERS = 64
-"""Connections that have not said yet who they are, at once; more are closed unread."""
+"""Connections that have not identified themselves yet, at once; more are closed unread."""
 STRANGER_SECONDS = 10.0
 """Time that a connection has to say who it is [s]."""
 HEALTH_PATHS = ("/healthz", "/health")
@@ -26,7 +26,7 @@ _SCHEMES = ("bearer", "api-key")
 """Words in front of a token; the second is that of openpi's client."""
 
 
-class DoorGuard:
+class ConnectionGuard:
     """Decides about connections and requests."""
 
     def __init__(self, connections: int, token: str | None = None, *, local: bool = False):
