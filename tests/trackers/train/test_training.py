@@ -493,7 +493,7 @@ def test_curves(trained, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
-def test_start_from_weights(env, trained, still, tmp_path):
+def test_start_from_weights(env, trained, tmp_path):
     """A new training begins with the network of a weights file, and keeps it while the critic learns."""
     file = export(trained.folder / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
     weights = {k: v.clone() for k, v in trained.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
