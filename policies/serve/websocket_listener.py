@@ -16,7 +16,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Origin
 
-from arena_newton.policies.serve.door_guard import STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.connection_guard import STRANGER_SECONDS, ConnectionGuard
 
 __all__ = ["WebsocketListener", "dismiss", "part"]
 
@@ -38,7 +38,7 @@ class WebsocketListener:
     def __init__(
         self,
         listening: socket.socket,
-        guard: DoorGuard,
+        guard: ConnectionGuard,
         serve_connection: Callable[[ServerConnection], None],
         answer_http: Callable[[ServerConnection, Request], Response | None],
         *,

@@ -283,7 +283,7 @@ CONSTANT = {
 @pytest.mark.parametrize("mode", CONSTANT)
 @pytest.mark.parametrize(("feature", "part"), [(STATE, "pre"), ("action", "post")])
 def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, feature, part):
-    """They make noise of every look, or one action of every answer; a feature of which one number changes is taken."""
+    """They make noise of every query, or one action of every answer; a feature of which one number changes is taken."""
     made, said = CONSTANT[mode]
     modes = {kind: mode for kind in ("VISUAL", "STATE", "ACTION", "ENV")} | {"VISUAL": "MEAN_STD"}
     edit(folder / "config.json", normalization_mapping=modes)

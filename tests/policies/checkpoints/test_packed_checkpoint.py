@@ -33,6 +33,7 @@ OURS = {
     "labels": "v4",
     "realign": 0.002,
     "task_vector": TASKS,
+    "tracker_vector": ("sonic", "twist2"),
     "tasks": TASKS,
     "trackers": ("twist2",),
 }
@@ -95,11 +96,11 @@ def test_lerobot_is_not_imported(packed, monkeypatch):
 
 
 def test_a_task_vector_decides(packed):
-    """The task is an input: another one changes the answer."""
+    """Task and tracker are inputs: another one changes the answer."""
     policy = LearnedPolicy(packed)
     policy.card = dataclasses.replace(policy.card, tasks=TASKS)
-    answers = [policy.act(seen([5], [0], task=task)).actions for task in TASKS]
-    assert not torch.equal(*answers)
+    looks = [seen([5], [0], task=task, tracker=tracker) for task in TASKS for tracker in ("sonic", "twist2", "")]
+    assert len({tuple(policy.act(look).actions.flatten().tolist()) for look in looks}) == 6
 
 
 def test_one_task_needs_no_vector(tmp_path):
@@ -151,7 +152,7 @@ def test_the_number_of_cores_changes_nothing(packed):
         alone = follow(LearnedPolicy(packed), [4], 1)[4]
         torch.set_num_threads(3)
         assert torch.equal(follow(LearnedPolicy(packed), [4], 1)[4], alone)
-        assert torch.equal(follow(LearnedPolicy(packed), [*range(4, 9)], 1)[4], alone)  # five looks side by side
+        assert torch.equal(follow(LearnedPolicy(packed), [*range(4, 9)], 1)[4], alone)  # five queries side by side
         assert torch.get_num_threads() == 3
         with ThreadPoolExecutor(1) as later:
             assert later.submit(torch.get_num_threads).result() == 3
@@ -161,12 +162,12 @@ def test_the_number_of_cores_changes_nothing(packed):
 
 def test_worlds_that_cannot_be_served_get_an_error(packed):
     """A state that is not finite is its world's error; worlds that do not ask are left alone."""
-    policy, look = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
-    look.state[1, 7] = float("nan")
-    answer = policy.act(look)
+    policy, query = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
+    query.state[1, 7] = float("nan")
+    answer = policy.act(query)
     assert list(answer.errors) == [1] and "not finite" in answer.errors[1]
     assert torch.equal(answer.actions[0], policy.act(seen([1], [0])).actions[0])
-    blind = Observation(look.state, None, look.mask, "boxing", "boxing", "Strike.")
+    blind = Observation(query.state, None, query.mask, "boxing", "boxing", "Strike.")
     with pytest.raises(InputError, match=r"expected pictures of \[64, 64, 3\], was given none"):
         policy.act(blind)
 

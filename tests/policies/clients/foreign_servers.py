@@ -125,8 +125,8 @@ class Recorder:
         with self.lock:
             self.seen.append((kind, content))
 
-    def fault(self, look):
-        return self.behave.get(float(look.state[0]), self.behave.get("any", ""))
+    def fault(self, query):
+        return self.behave.get(float(query.state[0]), self.behave.get("any", ""))
 
 
 class SocketServer(Recorder):
@@ -184,16 +184,16 @@ class SocketServer(Recorder):
                     socket.close(1011, "Internal server error.")
                     return
                 continue
-            self.note("look", request)
+            self.note("query", request)
             if not self.fail(socket, request):
                 seed = known.get(request.session) if request.seed is None else request.seed
                 rows = answer(request.state, request.image, seed, request.step)
                 socket.send(openpi_codec.pack_answer(rows, 1.0, roboarena=self.protocol == "roboarena"))
 
-    def fail(self, socket, look):
+    def fail(self, socket, query):
         """Fail as `behave` says; whether it did."""
-        kind = self.fault(look)
-        good = answer(look.state, look.image, 0, 0)
+        kind = self.fault(query)
+        good = answer(query.state, query.image, 0, 0)
         wrong = {
             "39": good[:, :39],
             "nan": np.where(np.arange(40) == 20, np.nan, good).astype(np.float32),
@@ -256,7 +256,7 @@ class SocketServer(Recorder):
                 continue
             if request.packed is not None:
                 request = dataclasses.replace(request, image=request.packed.unpacked(), packed=None)
-            self.note("look", request)
+            self.note("query", request)
             kind = self.fault(request)
             if kind == "text":
                 socket.send(vla_eval_codec.pack_error("RuntimeError: CUDA out of memory", message.seq, 0.0))
@@ -426,7 +426,7 @@ class HttpServer(Recorder):
                     return
                 front = asked["observation"]["images"]["front"]
                 image = np.frombuffer(base64.b64decode(front["data_b64"]), np.uint8).reshape(front["shape"])
-                outer.note("look", image.shape)
+                outer.note("query", image.shape)
                 if outer.behave.get("any") == "unknown":
                     self.answer(409, {"error": "unknown episode"})
                     return

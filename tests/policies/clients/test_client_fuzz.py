@@ -66,7 +66,7 @@ class Answering(SocketServer):
         self.replies = replies
         super().__init__(protocol, facts(needs_picture=False, picture=None))
 
-    def fail(self, socket, look):
+    def fail(self, socket, query):
         with self.lock:
             reply = self.replies.pop() if self.replies else None
         if reply is None:
@@ -74,8 +74,8 @@ class Answering(SocketServer):
         socket.send(reply)
         return True
 
-    def fault(self, look):
-        return "39"  # sends vla-eval's looks to `fail`, too
+    def fault(self, query):
+        return "39"  # sends vla-eval's queries to `fail`, too
 
 
 def drive(server, policy, count):
