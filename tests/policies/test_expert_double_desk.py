@@ -5,17 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from recorded_actions import Actions
+from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import policies, trackers
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.double_desk import LONGEST, MOST_ROLL, RIGHT_ROLL, SILL_STEP, DoubleDeskExpert
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.canonical import ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS
-from arena_newton.rollout import Rollout
-from arena_newton.rules import seeding
 
 SEED, EPISODES = 904, (0, 1)
 """Two episodes that no number of the expert was tuned on."""
@@ -29,11 +27,6 @@ def env():
     return ArenaEnv("double_desk", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", threads=2)
 
 
-def episodes(env, numbers=EPISODES):
-    """Episodes of the protocol by their numbers."""
-    return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, SEED, i)) for i in numbers]
-
-
 @pytest.fixture(scope="module")
 def played(env):
     """Both episodes from beginning to end: results, actions by seed, and ticks in which the sill was touched."""
@@ -45,9 +38,7 @@ def played(env):
             pairs = data.contact.geom[data.contact.dist < 0.0]
             touched[world] += bool((pairs == sill).any())
 
-    actions = Actions()
-    results = Rollout(env, policies.get("expert"), episodes(env), recorder=[actions], on_tick=count).run()
-    return results, actions.rows, touched
+    return *expert_rollout(env, episodes(env, *EPISODES, group=SEED), on_tick=count), touched
 
 
 def test_two_episodes_end_in_the_crate(played):
@@ -63,7 +54,7 @@ def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
     """From hover to lift the right wrist rolls on with every decision, to its end; before that it rests."""
     results, actions, _ = played
     column = ACTION["joint_pos"].start + CANONICAL_JOINTS.index("right_wrist_roll_joint")
-    for episode, result in zip(episodes(env), results, strict=True):
+    for episode, result in zip(episodes(env, *EPISODES, group=SEED), results, strict=True):
         roll = torch.stack(actions[episode.episode_seed]).numpy()[:, column]
         begins = {name: tick + len(roll) - result.steps for name, tick in result.phases}
         assert (roll[: begins["hover"]] == 0.0).all()
@@ -76,19 +67,15 @@ def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
 
 def test_worlds_are_independent(env, played):
     """An episode's actions are the same bits in either world, next to either episode."""
-    _, first, _ = played
-    second = Actions()
-    Rollout(env, policies.get("expert"), episodes(env, (5, *EPISODES[:1])), recorder=[second], max_steps=200).run()
-    (shared,) = set(first) & set(second.rows)
-    again, other = (torch.stack(second.rows[seed]) for seed in sorted(second.rows, key=shared.__ne__))
-    assert len(again) >= 200 and torch.equal(torch.stack(first[shared])[: len(again)], again)
-    assert not torch.equal(again, other)
+    assert_same_elsewhere(env, played[1], episodes(env, 5, EPISODES[0], group=SEED))
+    one, other = (torch.stack(rows[:200]) for rows in played[1].values())
+    assert not torch.equal(one, other)
 
 
 @pytest.fixture
 def expert(env):
     """An expert of worlds that have just been reset, with a reference that stands still."""
-    env.reset([episode.episode_seed for episode in episodes(env)])
+    env.reset([episode.episode_seed for episode in episodes(env, *EPISODES, group=SEED)])
     found = DoubleDeskExpert(Sight(env))
     found.reference = SimpleNamespace(phase=torch.zeros(env.worlds))
     found.begin(torch.ones(env.worlds, dtype=torch.bool), Style(env.worlds))

@@ -4,14 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import policies, trackers
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.football import CLEAR, LANE, FootballExpert
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.rotations import rotate_xy
-from arena_newton.rollout import Rollout
-from arena_newton.rules import seeding
 from arena_newton.tasks.football import GOAL
 
 GOAL_MIDDLE, GOAL_HALF = (0.05, 4.03, 0.925), (2.55, 1.0, 0.925)
@@ -133,24 +132,7 @@ def test_worlds_outside_the_mask_keep_their_state():
 def test_goals_through_twist2_whatever_runs_beside():
     """A left and a right foot score, phase by phase; alone an episode has the same actions bit for bit."""
     env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", threads=2)
-    episodes = [
-        SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, *who)) for who in ((900, 3), (900, 4))
-    ]
-    kept = []
-    for batch, ticks in ((episodes, 700), (episodes[:1], 250)):
-        policy, actions = policies.get("expert"), []
-        act = policy.act
-
-        def noted(observation, act=act, actions=actions):
-            chunk = act(observation)
-            if observation.mask[0]:
-                actions.append(chunk.actions[0].clone())
-            return chunk
-
-        policy.act = noted
-        results = Rollout(env, policy, batch, max_steps=ticks).run()
-        if len(batch) == 2:
-            assert [r.outcome for r in results] == ["success", "success"]
-            assert all([name for name, _ in r.phases][:3] == ["approach", "kick", "follow"] for r in results)
-        kept.append(torch.stack(actions)[:250])
-    assert len(kept[1]) == 250 and torch.equal(kept[0], kept[1])
+    results, rows = expert_rollout(env, episodes(env, 3, 4), 700)
+    assert [r.outcome for r in results] == ["success", "success"]
+    assert all([name for name, _ in r.phases][:3] == ["approach", "kick", "follow"] for r in results)
+    assert_same_elsewhere(env, rows, episodes(env, 3))

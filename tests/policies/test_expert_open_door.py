@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import policies, trackers
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.open_door import (
     AJAR,
@@ -26,8 +27,6 @@ from arena_newton.policies.experts.open_door import (
 )
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.rotations import rotate_xy
-from arena_newton.rollout import Rollout
-from arena_newton.rules import seeding
 from arena_newton.tasks.open_door import DOORWAY, HANDLE, LEAF
 
 PIVOT = (0.43, -0.065)
@@ -215,25 +214,8 @@ def test_worlds_outside_the_mask_keep_their_state(door):
 def test_doors_through_twist2_whatever_runs_beside():
     """Both robots pass the door at their first try; alone an episode has the same actions bit for bit."""
     env = ArenaEnv("open_door", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", threads=2)
-    episodes = [
-        SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, *who)) for who in ((900, 5), (900, 1))
-    ]
-    kept = []
-    for batch, ticks in ((episodes, 900), (episodes[:1], 200)):
-        policy, actions = policies.get("expert"), []
-        act = policy.act
-
-        def noted(observation, act=act, actions=actions):
-            chunk = act(observation)
-            if observation.mask[0]:
-                actions.append(chunk.actions[0].clone())
-            return chunk
-
-        policy.act = noted
-        results = Rollout(env, policy, batch, max_steps=ticks).run()
-        if len(batch) == 2:
-            assert [r.outcome for r in results] == ["success", "success"]
-            order = ["approach", "step in", "lower", "press", "push"]
-            assert all([name for name, _ in r.phases] == order for r in results)
-        kept.append(torch.stack(actions)[:200])
-    assert len(kept[1]) == 200 and torch.equal(kept[0], kept[1])
+    results, rows = expert_rollout(env, episodes(env, 5, 1), 900)
+    assert [r.outcome for r in results] == ["success", "success"]
+    order = ["approach", "step in", "lower", "press", "push"]
+    assert all([name for name, _ in r.phases] == order for r in results)
+    assert_same_elsewhere(env, rows, episodes(env, 5))

@@ -1,20 +1,17 @@
 """P&PBox's expert: a squeeze of the wanted depth, phases bounded in time, a box put down and let go."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
-from recorded_actions import Actions
+from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import policies, trackers
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts import pp_box
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.pp_box import LONGEST, PPBoxExpert, pose_before
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.g1 import TICK
-from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from arena_newton.tasks.pp_box import BOX
 
@@ -23,11 +20,6 @@ STILL = 6
 DT = DECISION * TICK
 ORDER = [name for name in LONGEST if name not in ("retreat", "stand", "leave")]
 """Phases of an episode without a slip until the box is let go."""
-
-
-def episodes(env, *repeats):
-    """Episodes of group seed 900 for a rollout."""
-    return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, 900, i)) for i in repeats]
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +40,8 @@ def twist2():
 @pytest.fixture(scope="module")
 def played(twist2):
     """Two episodes through our weights: results, actions by seed, and the judge's forces at the end."""
-    actions = Actions()
-    results = Rollout(twist2, policies.get("expert"), episodes(twist2, 5, 8), recorder=actions, max_steps=1600).run()
-    return results, actions.rows, twist2.physics.pair_force.numpy().copy()
+    results, rows = expert_rollout(twist2, episodes(twist2, 5, 8), 1600)
+    return results, rows, twist2.physics.pair_force.numpy().copy()
 
 
 def everybody(expert):
@@ -197,9 +188,4 @@ def test_our_twist2_puts_the_box_down_and_lets_go(played):
 
 def test_an_episode_does_not_depend_on_its_world(twist2, played):
     """The same episode in another world, next to another one, gets the same actions bit for bit."""
-    _, first, _ = played
-    actions = Actions()
-    Rollout(twist2, policies.get("expert"), episodes(twist2, 9, 5), recorder=actions, max_steps=200).run()
-    (seed,) = first.keys() & actions.rows.keys()
-    again = torch.stack(actions.rows[seed])
-    assert len(again) > 200 and torch.equal(torch.stack(first[seed])[: len(again)], again)
+    assert_same_elsewhere(twist2, played[1], episodes(twist2, 9, 5))

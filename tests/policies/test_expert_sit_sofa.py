@@ -2,21 +2,19 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from recorded_actions import Actions
+from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import policies, trackers
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.planning import BLOCKED, Floor, footprint, plan, signed_distance
 from arena_newton.policies.experts.sit_sofa import LONGEST, SOFA, TABLE, SitSofaExpert
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.g1 import TICK
-from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.sit_sofa import CARTONS
@@ -27,11 +25,6 @@ BLOCKED_FIRST = (900, 6)
 """Group seed and repeat of an episode whose carton is in front of the gap: the gate next to the armrest has no path."""
 SAT = ["approach", "sideways", "back", "stand", "lower"]
 """Phases of an episode at least, in this order."""
-
-
-def episodes(env, *repeats):
-    """Episodes of group seed 900 for a rollout."""
-    return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, 900, i)) for i in repeats]
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +113,7 @@ def test_only_masked_worlds_change(still):
 @pytest.fixture(scope="module")
 def played(twist2):
     """Two episodes through our weights, in 90 % of the budget: results and actions by seed."""
-    actions = Actions()
-    results = Rollout(twist2, policies.get("expert"), episodes(twist2, 0, 4), recorder=actions, max_steps=945).run()
-    return results, actions.rows
+    return expert_rollout(twist2, episodes(twist2, 0, 4), 945)
 
 
 def test_our_twist2_sits_down(played):
@@ -136,18 +127,13 @@ def test_our_twist2_sits_down(played):
 
 def test_an_episode_does_not_depend_on_its_world(twist2, played):
     """The same episode in another world, next to another one, gets the same actions bit for bit."""
-    _, first = played
-    actions = Actions()
-    Rollout(twist2, policies.get("expert"), episodes(twist2, 4, 8), recorder=actions, max_steps=200).run()
-    (seed,) = first.keys() & actions.rows.keys()
-    again = torch.stack(actions.rows[seed])
-    assert len(again) > 200 and torch.equal(torch.stack(first[seed])[: len(again)], again)
+    assert_same_elsewhere(twist2, played[1], episodes(twist2, 4, 8))
 
 
 def test_a_missed_seat_is_tried_again():
     """A robot whose sitting does not count stands up, steps back again and sits down a second time."""
     env = ArenaEnv("sit_sofa", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
     env.judge.rule = dataclasses.replace(env.judge.rule, min_force=1e9)
-    (result,) = Rollout(env, policies.get("expert"), episodes(env, 0), max_steps=1400).run()
+    (result,), _ = expert_rollout(env, episodes(env, 0), 1400)
     assert result.outcome == "timeout"  # no fall
     assert [name for name, _ in result.phases][:13] == [*LONGEST, "back", "stand", "lower"]

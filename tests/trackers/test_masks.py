@@ -2,11 +2,12 @@
 
 import pytest
 import torch
+from made_inputs import inputs, rows
 from onnx_files import twist2_like
 from test_sonic import official_like
 
 from arena_newton import trackers
-from arena_newton.trackers import RobotState, Tracker, TrackerCommand
+from arena_newton.trackers import Tracker
 from arena_newton.trackers.front_end import FrontEnd, NetworkTracker
 from arena_newton.trackers.interface import ActionForm
 from arena_newton.trackers.sonic import SonicFrontEnd
@@ -17,41 +18,56 @@ ONLY = torch.tensor([False, True, False])
 FRONTS = {"twist2": Twist2FrontEnd, "sonic": SonicFrontEnd}
 
 
-def inputs(seed: int, device: str = "cpu") -> tuple[TrackerCommand, RobotState]:
-    rng = torch.Generator().manual_seed(seed)
-
-    def draw(width):
-        return torch.randn(WORLDS, width, generator=rng).to(device)
-
-    quat, target = (torch.nn.functional.normalize(draw(4)) for _ in range(2))
-    return TrackerCommand(draw(35), draw(29), draw(29), target), RobotState(quat, draw(3), draw(29), draw(29))
-
-
 def check(stepped: Tracker, still: Tracker, device: str = "cpu") -> None:
     """World 1 of `stepped` takes three ticks more than in `still`, the first of them at its start."""
     only = ONLY.to(device)
     for tracker in (stepped, still):
         tracker.bind(WORLDS, device)
     for extra in (100, 200, 300):
-        stepped.step(*inputs(extra, device), only)
+        stepped.step(*inputs(extra, WORLDS, device), only)
         for tick in range(2):
-            answers = [tracker.step(*inputs(extra + tick, device)).clone() for tracker in (stepped, still)]
+            answers = [tracker.step(*inputs(extra + tick, WORLDS, device)).clone() for tracker in (stepped, still)]
             assert torch.equal(answers[0][~only], answers[1][~only])
-    held = still.step(*inputs(7, device)).clone()
-    assert not torch.equal(stepped.step(*inputs(7, device))[only], held[only])
+    held = still.step(*inputs(7, WORLDS, device)).clone()
+    assert not torch.equal(stepped.step(*inputs(7, WORLDS, device))[only], held[only])
 
 
-@pytest.mark.parametrize("name", ["twist2", "sonic"])
-def test_own_weights(name):
-    """Our weights: worlds 0 and 2 answer as if world 1 had not been stepped."""
-    check(trackers.get(name), trackers.get(name))
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Kind and name of a tracker → its checkpoint: our weights, or files like the official ones."""
+    folder = tmp_path_factory.mktemp("official")
+    twist2, sonic = twist2_like(folder / "like.onnx"), official_like(folder / "sonic", levels=16)
+    return {"own twist2": None, "own sonic": None, "official twist2": twist2, "official sonic": sonic}
 
 
-@pytest.mark.parametrize("name", ["twist2", "sonic"])
-def test_official_files(name, tmp_path):
-    """Official ONNX files: worlds 0 and 2 answer as if world 1 had not been stepped."""
-    file = twist2_like(tmp_path / "like.onnx") if name == "twist2" else official_like(tmp_path / "sonic", levels=16)
-    check(trackers.get(name, file), trackers.get(name, file))
+KINDS = pytest.mark.parametrize("kind", ["own twist2", "own sonic", "official twist2", "official sonic"])
+
+
+@KINDS
+def test_masks_of_worlds(files, kind):
+    """Worlds 0 and 2 answer as if world 1 had not been stepped."""
+    check(*(trackers.get(kind.split()[1], files[kind]) for _ in range(2)))
+
+
+@KINDS
+def test_worlds_do_not_mix(files, kind):
+    """Twenty worlds, three, and one alone, in any order, give the same bits, also after a reset of some."""
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(3))
+    groups = [torch.arange(20), order, order[:3], order[7:8]]
+    bound = [trackers.get(kind.split()[1], files[kind]) for _ in groups]
+    for tracker, group in zip(bound, groups, strict=True):
+        tracker.bind(len(group))
+    for tick in range(5):
+        command, state = inputs(tick, 20)
+        targets = []
+        for tracker, group in zip(bound, groups, strict=True):
+            if tick == 0:
+                tracker.prefill(rows(command, group), rows(state, group), group % 2 == 0)
+            if tick == 3:
+                tracker.reset(group % 3 == 0)
+            targets.append(tracker.step(rows(command, group), rows(state, group)).clone())
+        for group, got in zip(groups, targets, strict=True):
+            assert torch.equal(got, targets[0][group])
 
 
 def test_package_from_outside(falcon):
@@ -63,7 +79,7 @@ def test_package_from_outside(falcon):
 
 def test_pd_has_no_history():
     """The PD tracker takes a mask and answers the reference."""
-    command, state = inputs(0)
+    command, state = inputs(0, WORLDS)
     assert trackers.get("pd").step(command, state, ONLY) is command.joints
 
 
@@ -74,8 +90,8 @@ def test_all_true_is_no_mask(name):
     for tracker in (plain, masked):
         tracker.bind(WORLDS)
     for tick in range(4):
-        expected = plain.step(*inputs(tick))
-        assert torch.equal(masked.step(*inputs(tick), torch.ones(WORLDS, dtype=torch.bool)), expected)
+        expected = plain.step(*inputs(tick, WORLDS))
+        assert torch.equal(masked.step(*inputs(tick, WORLDS), torch.ones(WORLDS, dtype=torch.bool)), expected)
         assert torch.equal(plain.observation(), masked.observation())
 
 
@@ -88,9 +104,9 @@ def test_front_end_histories(name):
         front.reset()
     stepped, still = fronts
     for tick in range(4):
-        stepped.observe(*inputs(50 + tick))
+        stepped.observe(*inputs(50 + tick, WORLDS))
         stepped.act(torch.randn(WORLDS, 29), ONLY)
-        seen = [front.observe(*inputs(tick)).clone() for front in fronts]
+        seen = [front.observe(*inputs(tick, WORLDS)).clone() for front in fronts]
         assert torch.equal(seen[0][~ONLY], seen[1][~ONLY])
         for front in fronts:
             front.act(torch.full((WORLDS, 29), float(tick)))

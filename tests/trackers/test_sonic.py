@@ -3,30 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from made_inputs import inputs
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot.g1 import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
-from arena_newton.trackers import RobotState, TrackerCommand
-from arena_newton.trackers.front_end import NetworkTracker
-from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicNet, SonicTracker
+from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicTracker
 
 ORDER = [MUJOCO_JOINTS.index(name) for name in CANONICAL_JOINTS]
-
-
-def inputs(seed: int, worlds: int) -> tuple[TrackerCommand, RobotState]:
-    rng = torch.Generator().manual_seed(seed)
-
-    def draw(width):
-        return torch.randn(worlds, width, generator=rng)
-
-    quat, target = (torch.nn.functional.normalize(draw(4)) for _ in range(2))
-    command = TrackerCommand(draw(35), draw(29), 5.0 * draw(29), target)
-    return command, RobotState(quat, draw(3), draw(29), 10.0 * draw(29))
-
-
-def rows(value, index):
-    return type(value)(**{name: tensor[index] for name, tensor in vars(value).items()})
 
 
 def matrix(quat: np.ndarray) -> np.ndarray:
@@ -128,28 +112,6 @@ def test_prefill():
     assert (spin[1, :9] == 0).all() and (front.obs[:, 1762 + 610 : 1762 + 900] == 0).all()
 
 
-def test_worlds_do_not_mix():
-    """Twenty worlds, three, and one alone, in any order, give the same bits, also after a reset of some."""
-    torch.manual_seed(0)
-    network = SonicNet().eval()
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(3))
-    groups = [torch.arange(20), order, order[:3], order[7:8], torch.arange(13)]
-    bound = [NetworkTracker(SonicFrontEnd(), network) for _ in groups]
-    for tracker, group in zip(bound, groups, strict=True):
-        tracker.bind(len(group))
-    for tick in range(5):
-        command, state = inputs(tick, 20)
-        targets = []
-        for tracker, group in zip(bound, groups, strict=True):
-            if tick == 0:
-                tracker.prefill(rows(command, group), rows(state, group), group % 2 == 0)
-            if tick == 3:
-                tracker.reset(group % 3 == 0)
-            targets.append(tracker.step(rows(command, group), rows(state, group)).clone())
-        for group, got in zip(groups, targets, strict=True):
-            assert torch.equal(got, targets[0][group])
-
-
 def test_nan_leaves_with_reset():
     """NaN in one world leaves the others' bits alone and is gone after that world's reset."""
     clean, dirty = SonicFrontEnd(), SonicFrontEnd()
@@ -238,17 +200,6 @@ def test_official_networks(tmp_path, encoder):
             raw[world] = sessions[1].run(None, {"obs": decoder_input})[0]
         expected = front.act(torch.from_numpy(raw))
         torch.testing.assert_close(tracker.step(command, state), expected, atol=1e-4, rtol=1e-4)
-
-
-def test_official_worlds_do_not_mix(tmp_path):
-    """Networks that run in onnxruntime give a world the same bits alone and among others."""
-    folder = official_like(tmp_path / "sonic", levels=16)
-    one, many = trackers.get("sonic", folder), trackers.get("sonic", folder)
-    one.bind(1)
-    many.bind(7)
-    for tick in range(3):
-        command, state = inputs(tick, 7)
-        assert torch.equal(many.step(command, state)[2:3], one.step(rows(command, [2]), rows(state, [2])))
 
 
 def test_ways_to_name_the_pair(tmp_path):

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from made_inputs import inputs
 from onnx_files import twist2_like
 
 from arena_newton import trackers
 from arena_newton.robot.g1 import DEFAULT_POSE, TWIST2_DRIVE
-from arena_newton.trackers import RobotState, TrackerCommand
 from arena_newton.trackers.twist2 import OBSERVATION, Twist2Tracker
 
 
@@ -20,21 +20,6 @@ def tracker_on(checkpoint, worlds: int) -> Twist2Tracker:
     tracker = trackers.get("twist2", checkpoint)
     tracker.bind(worlds)
     return tracker
-
-
-def inputs(seed: int, worlds: int) -> tuple[TrackerCommand, RobotState]:
-    rng = torch.Generator().manual_seed(seed)
-
-    def draw(width):
-        return torch.randn(worlds, width, generator=rng)
-
-    quat = torch.nn.functional.normalize(draw(4))
-    command = TrackerCommand(draw(35), draw(29), draw(29), quat)
-    return command, RobotState(quat, draw(3), draw(29), 30.0 * draw(29))
-
-
-def rows(value, index):
-    return type(value)(**{name: tensor[index] for name, tensor in vars(value).items()})
 
 
 class Oracle:
@@ -100,24 +85,6 @@ def test_clips(checkpoint):
     np.testing.assert_allclose(targets.numpy(), np.tile(np.array(DEFAULT_POSE) - 5.0, (2, 1)), atol=1e-6)
     assert (tracker.last_action == -25.0).all()
     assert tracker.observation()[0, 3] == 100.0 and tracker.observation()[0, 1397 + 3] == 100.0
-
-
-def test_worlds_do_not_mix(checkpoint):
-    """Twenty worlds, three, and one alone, in any order, give the same bits, also after a reset of some."""
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(3))
-    groups = [torch.arange(20), order, order[:3], order[7:8], torch.arange(13)]
-    bound = [tracker_on(checkpoint, len(group)) for group in groups]
-    for tick in range(6):
-        command, state = inputs(tick, 20)
-        targets = []
-        for tracker, group in zip(bound, groups, strict=True):
-            if tick == 0:
-                tracker.prefill(rows(command, group), rows(state, group), group % 2 == 0)
-            if tick == 3:
-                tracker.reset(group % 3 == 0)
-            targets.append(tracker.step(rows(command, group), rows(state, group)).clone())
-        for group, got in zip(groups, targets, strict=True):
-            assert torch.equal(got, targets[0][group])
 
 
 def test_nan_stays_in_its_world(checkpoint):

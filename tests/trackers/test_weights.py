@@ -5,12 +5,13 @@ import json
 
 import pytest
 import torch
+from made_inputs import inputs
 from safetensors.torch import save_file
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot.g1 import SONIC_DRIVE, TWIST2_DRIVE, PhysicsRate
-from arena_newton.trackers import RobotState, TrackerCommand, base
+from arena_newton.trackers import base
 from arena_newton.trackers.front_end import residual_form
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm
@@ -38,16 +39,6 @@ def files(tmp_path_factory):
     for interface in ("twist2", "sonic"):
         weights_file.save(folder / f"{interface}.safetensors", trained(interface))
     return folder
-
-
-def inputs(seed: int, worlds: int):
-    rng = torch.Generator().manual_seed(seed)
-
-    def draw(width):
-        return torch.randn(worlds, width, generator=rng)
-
-    quat, target = (torch.nn.functional.normalize(draw(4)) for _ in range(2))
-    return TrackerCommand(draw(35), draw(29), draw(29), target), RobotState(quat, draw(3), draw(29), draw(29))
 
 
 @pytest.mark.parametrize("interface", ["twist2", "sonic"])
@@ -80,18 +71,6 @@ def test_tracker(files, interface):
     assert tracker.drive == weights.drive and tracker.physics_rate == tracker.fast_physics_rate == RATE
     assert tracker.card == CARD and tracker.name == interface
     assert tracker.describe()["checkpoint_hash"] == weights_file.load(files / f"{interface}.safetensors").sha256[:12]
-
-
-@pytest.mark.parametrize("interface", ["twist2", "sonic"])
-def test_worlds_do_not_mix(files, interface):
-    """Our trackers, too, give a world the same bits alone and among others."""
-    one, many = (trackers.get(interface, files / f"{interface}.safetensors") for _ in range(2))
-    one.bind(1)
-    many.bind(11)
-    for tick in range(3):
-        command, state = inputs(tick, 11)
-        row = [type(v)(**{k: t[4:5] for k, t in vars(v).items()}) for v in (command, state)]
-        assert torch.equal(many.step(command, state)[4:5], one.step(*row))
 
 
 def test_residual_form():

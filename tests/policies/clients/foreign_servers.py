@@ -18,6 +18,7 @@ from json_server import JsonHandler, JsonServer
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
+from arena_newton import policies
 from arena_newton.data.readers.label_protocols import action_names
 from arena_newton.data.recording.layouts import state_names
 from arena_newton.pictures.camera import CameraConfig
@@ -101,10 +102,21 @@ def observation(worlds, mask=None, size=SIZE):
     return Observation(state, picture, mask, "football", "Isaac-Football", "Kick the ball.")
 
 
+OPENED = []
+"""Servers and policies of a test; the fixture `closed` closes them after it."""
+
+
+def asking(url, **options):
+    """The policy that asks a server."""
+    OPENED.append(policies.get(f"remote:{url}", **options))
+    return OPENED[-1]
+
+
 class Recorder:
     """Memory of a server, and the faults that it is told to have."""
 
     def __init__(self):
+        OPENED.append(self)
         self.lock, self.release = threading.Lock(), threading.Event()
         self.behave, self.seen, self.tokens, self.live = {}, [], [], []
         self.connections = 0

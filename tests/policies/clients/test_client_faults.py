@@ -7,9 +7,8 @@ import time
 
 import numpy as np
 import pytest
-from foreign_servers import Gr00tServer, HttpServer, SocketServer, facts, observation
+from foreign_servers import Gr00tServer, HttpServer, SocketServer, asking, facts, observation
 
-from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.remote.address import TOKEN_VARIABLE
@@ -29,7 +28,7 @@ def started(protocol, **options):
 
 def client(server, **options):
     """Its client, checked and with episodes begun in three worlds."""
-    policy = policies.get(f"remote:{server.url}", **({"timeout": 3.0, "retries": 2, "backoff": 0.01} | options))
+    policy = asking(server.url, **({"timeout": 3.0, "retries": 2, "backoff": 0.01} | options))
     policy.check()
     policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
     while server.url.startswith("vla-eval") and sum(kind == "reset" for kind, _ in server.seen) < 3:
@@ -39,9 +38,7 @@ def client(server, **options):
 
 @pytest.fixture
 def running(request):
-    server = started(request.param)
-    yield server
-    server.close()
+    return started(request.param)
 
 
 @pytest.mark.parametrize("running", SOCKETS, indirect=True)
@@ -71,7 +68,6 @@ def test_bad_answer_ends_one_world(running, kind, text):
     running.behave = {}
     policy.reset([7, 18, 9], ["Isaac-Football"] * 3, np.array([False, True, False]))
     assert policy.act(observation(3)).errors == {}
-    policy.close()
 
 
 @pytest.mark.parametrize("running", ["vla-eval"], indirect=True)
@@ -82,7 +78,6 @@ def test_answers_to_something_else(running, kind, text):
     running.behave = {1.0: kind}
     chunk = policy.act(observation(3))
     assert set(chunk.errors) == {1} and text in chunk.errors[1]
-    policy.close()
 
 
 @pytest.mark.parametrize("running", SOCKETS, indirect=True)
@@ -99,7 +94,6 @@ def test_frames_that_nobody_asked_for(running):
     else:
         with pytest.raises(PolicyUnavailable, match="what the server knew of the running episode"):
             policy.act(observation(3))
-    policy.close()
 
 
 @pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
@@ -115,7 +109,6 @@ def test_deadline(running):
         chunk = policy.act(observation(3))
         assert set(chunk.errors) == {1} and "no reply within 0.3 s" in chunk.errors[1]
     assert time.monotonic() - start < 3.0
-    policy.close()
 
 
 @pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
@@ -132,7 +125,6 @@ def test_failed_reset_ends_its_world(running):
         assert set(chunk.errors) == {1} and "the server says" in chunk.errors[1]
     policy.reset([1, 2, 3], ["Isaac-Football"] * 3)
     assert policy.act(observation(3)).errors == {}
-    policy.close()
 
 
 @pytest.mark.parametrize("protocol", [*SOCKETS, "gr00t"])
@@ -152,8 +144,6 @@ def test_killed_server_stops_the_run(protocol, how):
     assert time.monotonic() - start < 4.0
     with pytest.raises(PolicyUnavailable, match="the server is gone"):
         policy.reset([1, 2, 3], ["Isaac-Football"] * 3) if protocol != "openpi" else policy.act(observation(3))
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", [*SOCKETS, "gr00t"])
@@ -173,8 +163,6 @@ def test_restarted_server(protocol):
     policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
     again = policy.act(observation(3))
     assert again.errors == {} and np.asarray(again.actions).tobytes() == first.tobytes()
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", SOCKETS)
@@ -186,8 +174,6 @@ def test_restart_before_the_first_query(protocol):
     server = started(protocol, port=server.port)
     assert policy.act(observation(3)).errors == {}
     assert protocol == "openpi" or sorted(s.seed for kind, s in server.seen if kind == "reset") == [7, 8, 9]
-    policy.close()
-    server.close()
 
 
 def test_another_policy_after_a_restart():
@@ -198,14 +184,12 @@ def test_another_policy_after_a_restart():
     server = SocketServer("openpi", facts(policy="another"), port=server.port)
     with pytest.raises(PolicyUnavailable, match="declares something else"):
         policy.act(observation(3))
-    policy.close()
-    server.close()
 
 
 def test_a_server_that_greets_with_garbage_is_there():
     """Garbage is an answer of a server that is there; silence and a closed port are none."""
     server = SocketServer("openpi", metadata=b"\xc1\xff")
-    link = policies.get(f"remote:{server.url}")._connect()
+    link = asking(server.url)._connect()
     assert link.alive(10.0)
     server.close()
     assert not link.alive(1.0)
@@ -226,8 +210,6 @@ def test_greeting_that_broke_after_a_restart():
     assert "not MessagePack" in told[0] or "the connection broke" in told[0]
     assert all("not MessagePack" in one for one in told[1:])
     assert server.seen == []
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "http"])
@@ -239,8 +221,6 @@ def test_episode_that_the_server_does_not_know(protocol):
     server.behave = {"any": "unknown"}
     with pytest.raises(PolicyUnavailable, match="unknown episode"):
         policy.act(observation(3))
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("running", ["openpi", "vla-eval", "gr00t"], indirect=True)
@@ -254,7 +234,6 @@ def test_server_without_a_usable_answer_stops_the_run(running):
             errors += len(policy.act(observation(3)).errors)
             policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
     assert errors < MAX_FAILURES
-    policy.close()
 
 
 @pytest.mark.parametrize(
@@ -279,8 +258,6 @@ def test_bad_answer_of_gr00t(kind, text):
     assert text in chunk.errors[0] and server.url in chunk.errors[0] and "\n" not in chunk.errors[0]
     server.behave = {}
     assert policy.act(observation(3)).errors == {}
-    policy.close()
-    server.close()
 
 
 def test_bad_row_of_gr00t():
@@ -290,8 +267,6 @@ def test_bad_row_of_gr00t():
     server.behave = {1.0: "nan"}
     chunk = policy.act(observation(3))
     assert set(chunk.errors) == {1} and "(index 20) is nan" in chunk.errors[1]
-    policy.close()
-    server.close()
 
 
 def test_broken_state_is_not_sent_with_others():
@@ -305,8 +280,6 @@ def test_broken_state_is_not_sent_with_others():
     assert set(chunk.errors) == {1} and "not finite" in chunk.errors[1]
     ((_, data),) = server.seen
     assert len(data["observation"]["state"]["joint_pos"]) == 2
-    policy.close()
-    server.close()
 
 
 def raw_server(reply):
@@ -349,11 +322,10 @@ def test_check_refuses_what_is_no_policy_server(protocol, reply, text):
     """Something else at the address, a redirect too, is one line before the first episode."""
     listening = raw_server(reply)
     address = f"{protocol}://127.0.0.1:{listening.getsockname()[1]}"
-    policy = policies.get(f"remote:{address}", timeout=1.0, retries=1, backoff=0.01)
+    policy = asking(address, timeout=1.0, retries=1, backoff=0.01)
     with pytest.raises(InputError, match="gr00t" if protocol == "gr00t" else text) as caught:
         policy.check()
     assert "\n" not in str(caught.value) and address in str(caught.value)
-    policy.close()
     listening.close()
 
 
@@ -362,22 +334,20 @@ def test_nobody_there(protocol):
     """An address where nobody listens is one line, soon."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-    policy = policies.get(f"remote:{protocol}://127.0.0.1:{port}", timeout=5.0, retries=1, backoff=0.01)
+    policy = asking(f"{protocol}://127.0.0.1:{port}", timeout=5.0, retries=1, backoff=0.01)
     with pytest.raises(InputError, match="no server answers there"):
         policy.check()
-    policy.close()
 
 
 @pytest.mark.parametrize("protocol", ["ws", "vla-eval", "gr00t"])
 def test_silent_server(protocol):
     """A server that takes connections and never speaks is refused after one deadline."""
     with socket.create_server(("127.0.0.1", 0), backlog=64) as listening:
-        policy = policies.get(f"remote:{protocol}://127.0.0.1:{listening.getsockname()[1]}", timeout=0.2, retries=3)
+        policy = asking(f"{protocol}://127.0.0.1:{listening.getsockname()[1]}", timeout=0.2, retries=3)
         start = time.monotonic()
         with pytest.raises(InputError, match="within 0.2 s"):
             policy.check()
         assert time.monotonic() - start < 3.0
-        policy.close()
 
 
 @pytest.mark.parametrize("running", ["openpi", "vla-eval"], indirect=True)
@@ -390,21 +360,18 @@ def test_token_is_sent_and_never_told(running, monkeypatch):
     assert set(running.tokens) == {"Bearer s3kret-token"}
     assert "s3kret" not in str(chunk.errors) + str(policy.describe()) and "\x1b" not in str(chunk.errors)
     assert set(chunk.errors) == {1}
-    policy.close()
 
 
 def test_token_of_gr00t(monkeypatch):
     """GR00T's servers read the token in the message; without it the refusal is one line."""
     server = Gr00tServer(token="s3kret")
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=3.0, retries=0)
     with pytest.raises(InputError, match="Invalid API token"):
         policy.check()
     policy.close()
     monkeypatch.setenv(TOKEN_VARIABLE, "s3kret")
     policy = client(server)
     assert policy.act(observation(3)).errors == {} and "s3kret" not in json.dumps(policy.describe())
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
@@ -433,16 +400,14 @@ def test_wss(protocol, certificate):
     """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
     server = SocketServer(protocol, facts(), ssl=certificate[1])
     url = f"{protocol}+wss://127.0.0.1:{server.port}"
-    policy = policies.get(f"remote:{url}", timeout=3.0, retries=0)
+    policy = asking(url, timeout=3.0, retries=0)
     with pytest.raises(InputError, match="--remote-insecure does without"):
         policy.check()
     policy.close()
-    policy = policies.get(f"remote:{url}", timeout=3.0, retries=0, verify_ssl=False)
+    policy = asking(url, timeout=3.0, retries=0, verify_ssl=False)
     policy.check()
     policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
     server.behave = {1.0: "slow"}
     policy.timeout = 0.3
     chunk = policy.act(observation(3))
     assert set(chunk.errors) == {1} and "no reply within 0.3 s" in chunk.errors[1]
-    policy.close()
-    server.close()

@@ -6,9 +6,19 @@ import resource
 import msgpack
 import numpy as np
 import pytest
-from foreign_servers import CHUNK, MODALITIES, Gr00tServer, SocketServer, answer, facts, gr00t_packed, npy, observation
+from foreign_servers import (
+    CHUNK,
+    MODALITIES,
+    Gr00tServer,
+    SocketServer,
+    answer,
+    asking,
+    facts,
+    gr00t_packed,
+    npy,
+    observation,
+)
 
-from arena_newton import policies
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack
@@ -101,13 +111,11 @@ def test_broken_replies_are_an_error_of_their_world(protocol, mutants):
         good = vla_eval_codec.pack_action(ROWS, 3, 1.0)
         replies = [*broken(good, mutants, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
     server = Answering(protocol, list(replies))
-    policy = policies.get(f"remote:{server.url}", timeout=1.0, retries=0, backoff=0.01)
+    policy = asking(server.url, timeout=1.0, retries=0, backoff=0.01)
     policy.check()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     drive(server, policy, len(replies))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
-    policy.close()
-    server.close()
 
 
 def gr00t_cases(mutants):
@@ -132,7 +140,7 @@ def gr00t_cases(mutants):
 def test_broken_replies_of_gr00t(mutants):
     """Damaged answers are refused in one line, or hold actions; nothing is unpickled and no memory filled."""
     server = Gr00tServer(declared=facts())
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=3.0, retries=0)
     policy.check()
     before, refused = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0
     cases = gr00t_cases(mutants)
@@ -151,8 +159,6 @@ def test_broken_replies_of_gr00t(mutants):
         assert all("\n" not in message and server.url in message for message in chunk.errors.values())
         policy.reset([1], ["Isaac-Football"])
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 * 1024
-    policy.close()
-    server.close()
 
 
 def test_arrays_of_gr00t_come_back():

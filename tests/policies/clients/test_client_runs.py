@@ -92,7 +92,6 @@ def test_server_killed_in_mid_run(tmp_path, capsys, protocol):
     assert results(tmp_path / "cut") == results(tmp_path / "whole")
     margins = {json.loads(line)["margin"] for line in results(tmp_path / "whole")[1]}
     assert len(margins) == 8
-    server.close()
 
 
 def test_another_server_under_the_same_address(tmp_path, capsys):
@@ -104,7 +103,6 @@ def test_another_server_under_the_same_address(tmp_path, capsys):
     server = SocketServer("openpi", facts(policy="another"), port=server.port)
     assert main(["resume", str(tmp_path / "o")], parts()) == 2
     assert "another" in capsys.readouterr().err
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "gr00t"])
@@ -116,7 +114,6 @@ def test_server_that_declares_nothing_is_said_once(tmp_path, capsys, protocol):
     assert capsys.readouterr().err.count("what stands in brackets is assumed") == 1
     config = json.loads((tmp_path / "o" / "config.json").read_text())["config"]
     assert config["policy_facts"]["assumed"]["rate"] == "50 Hz" and config["worlds"] == 2
-    server.close()
 
 
 def test_refusals_before_the_first_episode(tmp_path, monkeypatch, capsys):
@@ -128,4 +125,3 @@ def test_refusals_before_the_first_episode(tmp_path, monkeypatch, capsys):
         said = capsys.readouterr()
         assert text in said.err and said.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
-    server.close()

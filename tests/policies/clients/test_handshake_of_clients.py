@@ -10,7 +10,17 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from foreign_servers import CHUNK, MODALITIES, SIZE, Gr00tServer, HttpServer, SocketServer, facts, observation
+from foreign_servers import (
+    CHUNK,
+    MODALITIES,
+    SIZE,
+    Gr00tServer,
+    HttpServer,
+    SocketServer,
+    asking,
+    facts,
+    observation,
+)
 
 from arena_newton import policies
 from arena_newton.data.readers.label_protocols import V4, action_names
@@ -36,12 +46,8 @@ def server_of(protocol, declared, **options):
 
 def checked(server, **options):
     """Its client after `check`."""
-    policy = policies.get(f"remote:{server.url}", **({"timeout": 3.0, "retries": 0, "backoff": 0.01} | options))
-    try:
-        policy.check()
-    finally:
-        policy.close()
-        server.close()
+    policy = asking(server.url, **({"timeout": 3.0, "retries": 0, "backoff": 0.01} | options))
+    policy.check()
     return policy
 
 
@@ -96,7 +102,7 @@ def test_a_page_by_drips(scheme):
                 time.sleep(0.1)
 
     threading.Thread(target=drip, daemon=True).start()
-    policy = policies.get(f"remote:{scheme}://{address}", timeout=0.5)
+    policy = asking(f"{scheme}://{address}", timeout=0.5)
     began = time.monotonic()
     if scheme == "http":
         with suppress(OSError, http.client.HTTPException):
@@ -151,7 +157,7 @@ def test_greeting_that_is_none(metadata):
 def test_server_that_declares_nothing(protocol, capsys):
     """It is warned of once, tried with a robot that stands, and what is assumed is part of what results record."""
     server = SocketServer(protocol, metadata={})
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=3.0, retries=0)
     policy.check()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "does not declare its label protocol (v3.1), action names" in lines[0]
@@ -164,8 +170,6 @@ def test_server_that_declares_nothing(protocol, capsys):
         assert query.seed is None and query.step is None and query.task == "" and query.session == ""
     policy.reset([1, 2], ["Isaac-Football"] * 2)
     assert policy.act(observation(2, size=224)).errors == {} and capsys.readouterr().err == ""
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
@@ -230,7 +234,7 @@ def test_batched_server():
                 socket.send(pack({"actions": rows}, OPENPI_KEYS))
 
     server = Batched("openpi")
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=3.0, retries=0)
     policy.check()
     server.seen.clear()
     policy.reset([1, 2, 3], ["Isaac-Football"] * 3)
@@ -240,8 +244,6 @@ def test_batched_server():
     assert asked["observation/image"].shape == (2, SIZE, SIZE, 3) and asked["prompt"] == ["Kick the ball."] * 2
     server.behave = {"any": "nan"}
     assert set(policy.act(observation(3)).errors) == {2}
-    policy.close()
-    server.close()
 
 
 def modalities(**other):
@@ -291,7 +293,7 @@ def test_gr00t_without_a_declaration(keys, capsys):
     """A GR00T server is asked under its own names, for all worlds that ask at once, and its options stay empty."""
     made = modalities(action={"modality_keys": keys}) if keys else modalities()
     server = Gr00tServer(made)
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=3.0, retries=0)
     policy.check()
     assert "does not declare" in capsys.readouterr().err and policy.depends_on_worlds
     server.seen.clear()
@@ -304,8 +306,6 @@ def test_gr00t_without_a_declaration(keys, capsys):
     assert seen["video"]["ego_view"].shape == (2, 1, SIZE, SIZE, 3) and seen["state"]["joint_vel"].shape == (2, 1, 29)
     assert seen["language"] == {"annotation.human.task_description": [["Kick the ball."]] * 2}
     assert policy.describe()["modalities"]["video"] == "ego_view"
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("prefix", PREFIXES)

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from foreign_servers import SIZE, NoisePolicy, declared_servers, observation
+from foreign_servers import OPENED, SIZE, NoisePolicy, asking, declared_servers, observation
 
-from arena_newton import policies
 from arena_newton.policies import PolicyUnavailable
 from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
@@ -21,6 +20,7 @@ class OwnServer:
     """This package's server with the same policy."""
 
     def __init__(self, protocol, port=0):
+        OPENED.append(self)
         self.server = PolicyServer(NoisePolicy(), max_batch_size=8, max_wait=0.002, max_sessions=16)
         self.server.start("football")
         options = ServeOptions(policy="stand", protocol=protocol, port=port)
@@ -53,32 +53,28 @@ def ask(policy, seeds):
 def test_actions_are_the_same_through_every_protocol(name):
     """Each protocol carries state, picture, seed and step so that the actions are those of the policy itself."""
     server = SERVERS[name]()
-    policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
+    policy = asking(server.url, timeout=10.0, retries=1, backoff=0.01)
     policy.check()
     if not name.startswith("own"):
         assert not policy.depends_on_worlds and policy.describe()["server"].startswith("noise")
     assert (policy.camera.width, policy.camera.height) == (SIZE, SIZE)
     for got, wanted in zip(ask(policy, [5, 6, 7, 8]), ask(NoisePolicy(), [5, 6, 7, 8]), strict=True):
         assert got.tobytes() == wanted.tobytes()
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("name", ["own openpi", "own roboarena", "own vla-eval", "own arena", "gr00t"])
 def test_promises_of_a_policy_hold_through_every_protocol(name):
     """Seeds, resets, neighbours, broken states: what a policy promises, its client promises too."""
     server = SERVERS[name]()
-    policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=1, backoff=0.01)
+    policy = asking(server.url, timeout=10.0, retries=1, backoff=0.01)
     assert all(result.ok for result in check_policy(policy))
-    policy.close()
-    server.close()
 
 
 @pytest.mark.parametrize("protocol", OWN)
 def test_own_server_that_was_restarted(protocol):
     """A restarted server knows no running episode: the run stops, and the same episodes then give the same actions."""
     server = OwnServer(protocol)
-    policy = policies.get(f"remote:{server.url}", timeout=10.0, retries=4, backoff=0.05)
+    policy = asking(server.url, timeout=10.0, retries=4, backoff=0.05)
     policy.check()
     tasks = ["Isaac-Football"] * 2
     policy.reset([5, 6], tasks)
@@ -94,5 +90,3 @@ def test_own_server_that_was_restarted(protocol):
         policy.act(observation(2))
     policy.reset([5, 6], tasks)
     assert policy.act(observation(2)).actions.tobytes() == first
-    policy.close()
-    server.close()

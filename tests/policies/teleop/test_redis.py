@@ -1,5 +1,6 @@
 """Teleoperation through a real Redis server: a sender as the original's, and what none must be able to do."""
 
+import functools
 import io
 import json
 import shutil
@@ -99,6 +100,7 @@ class Clock:
         self.now += seconds
 
 
+@functools.cache
 def walk() -> np.ndarray:
     """Canonical actions: stand, walk while turning left, with the right hand closing."""
     generator, rows = ReferenceGenerator(1), []
@@ -115,23 +117,20 @@ def walk() -> np.ndarray:
     return actions
 
 
-ACTIONS = walk()
-
-
 class Sender:
     """Writes what the original's teleoperation server writes for given actions, at the pace of who calls it."""
 
     def __init__(self, client, heading0: float = 2.0):
         self.client, self.t = client, 1_700_000_000_000
         self.sequence = 0
-        quats = quat_from_rot6d(torch.from_numpy(ACTIONS[:, ACTION["root_rot6d"]]).double())
+        quats = quat_from_rot6d(torch.from_numpy(walk()[:, ACTION["root_rot6d"]]).double())
         joints = np.empty((TICKS, 29))
-        joints[:, list(CANONICAL_TO_MUJOCO)] = ACTIONS[:, ACTION["joint_pos"]]
+        joints[:, list(CANONICAL_TO_MUJOCO)] = walk()[:, ACTION["joint_pos"]]
         yaw = np.unwrap(heading(quats).numpy())
         rate = np.diff(yaw, prepend=yaw[0]) / TICK
         self.mimic = np.zeros((TICKS, 35))
-        self.mimic[:, MIMIC["velocity_xy"]] = ACTIONS[:, ACTION["root_xy_delta"]] / TICK
-        self.mimic[:, MIMIC["root_z"]] = ACTIONS[:, ACTION["root_z"]]
+        self.mimic[:, MIMIC["velocity_xy"]] = walk()[:, ACTION["root_xy_delta"]] / TICK
+        self.mimic[:, MIMIC["root_z"]] = walk()[:, ACTION["root_z"]]
         self.mimic[:, MIMIC["roll_pitch"]] = roll_pitch(quats).numpy()
         self.mimic[:, MIMIC["yaw_rate"]] = rate[:, None]
         self.mimic[:, MIMIC["joint_pos"]] = joints
@@ -140,22 +139,22 @@ class Sender:
         self.quats = quat_multiply(turned, quats)
         position, self.positions = np.array([3.0, -7.0]), []
         for tick in range(TICKS):
-            dx, dy = ACTIONS[tick, ACTION["root_xy_delta"]].astype(float)
-            rise = ACTIONS[tick, 2] - ACTIONS[max(tick - 1, 0), 2]
+            dx, dy = walk()[tick, ACTION["root_xy_delta"]].astype(float)
+            rise = walk()[tick, 2] - walk()[max(tick - 1, 0), 2]
             axes = [quat_apply(self.quats[tick], torch.eye(3, dtype=torch.float64)[i]).numpy() for i in range(3)]
             local_z = (rise - axes[0][2] * dx - axes[1][2] * dy) / axes[2][2]
             position = position + (axes[0] * dx + axes[1] * dy + axes[2] * local_z)[:2]
-            self.positions.append([*position, float(ACTIONS[tick, 2])])
+            self.positions.append([*position, float(walk()[tick, 2])])
 
     def write(self, frame: int, *, hands: str = "controller", step: int = 20, **changed) -> None:
         """One frame; `changed` replaces values of keys by name, None leaves one out."""
         self.t += step
-        closed = bool(ACTIONS[frame, 39])
+        closed = bool(walk()[frame, 39])
         values = {
             keys.ACTION_BODY: json.dumps(self.mimic[frame].tolist()),
             keys.ACTION_HANDS[0]: json.dumps([0.0] * 7),
             keys.ACTION_HANDS[1]: json.dumps(list(HAND_CLOSE_RIGHT if closed else [0.0] * 7)),
-            keys.GMR_JOINT_POS: json.dumps(ACTIONS[frame, ACTION["joint_pos"]].tolist()),
+            keys.GMR_JOINT_POS: json.dumps(walk()[frame, ACTION["joint_pos"]].tolist()),
             keys.GMR_BODY_POS: json.dumps(self.positions[frame]),
             keys.GMR_BODY_QUAT: json.dumps(self.quats[frame].tolist()),
             keys.GMR_FRAME_INDEX: frame,
@@ -207,7 +206,7 @@ def test_a_sender_drives_as_in_the_original(server, client, tracker, hands):
         sender.write(frame, hands=hands)
         actions.append(source.wish(view(frame)).action)
         clock.now += TICK
-    np.testing.assert_allclose(np.stack(actions), ACTIONS, atol=2e-5)
+    np.testing.assert_allclose(np.stack(actions), walk(), atol=2e-5)
     assert said == []
 
 
@@ -497,7 +496,7 @@ def test_a_session_is_driven_recorded_and_saved(server, client, env, tmp_path):
     (file,) = report.saved
     episode = EpisodeFile(file)
     assert episode.rows == TICKS + 60
-    np.testing.assert_allclose(episode.array("arena_action")[:TICKS], ACTIONS, atol=2e-5)
+    np.testing.assert_allclose(episode.array("arena_action")[:TICKS], walk(), atol=2e-5)
     walked = np.linalg.norm(places[TICKS] - places[START])
     assert walked > 0.5, walked
     assert np.linalg.norm(places[-1] - places[-10]) < 0.05

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from safetensors.torch import save_file
-from torchvision.models import resnet18
+from torchvision import models
 
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
@@ -15,7 +15,7 @@ SMALL = recipe("diffusion", "small")
 
 
 @pytest.fixture(scope="module")
-def model():
+def model(narrow_resnet):
     torch.manual_seed(0)
     return families.build(SMALL, made_stats(), "cpu")
 
@@ -92,10 +92,10 @@ def test_normalisation_is_lerobots(model):
     assert span.min() >= 2 * SMALL.state_std_floor * 0.999
 
 
-def test_pretrained_encoder_and_groups(tmp_path):
+def test_pretrained_encoder_and_groups(narrow_resnet, tmp_path):
     """A local ResNet is put into the encoder, whose parameters have their own learning rate."""
     torch.manual_seed(5)
-    tensors = resnet18().state_dict()
+    tensors = models.resnet18().state_dict()
     save_file(tensors, tmp_path / "model.safetensors")
     model = families.build(recipe("diffusion", "small", lr_backbone=1e-5), made_stats(), "cpu", weights=tmp_path)
     encoder = model.policy.diffusion.rgb_encoder[0].backbone
@@ -105,7 +105,7 @@ def test_pretrained_encoder_and_groups(tmp_path):
     assert len(rest["params"]) + len(backbone["params"]) == len(list(model.policy.parameters()))
 
 
-def test_task_vector():
+def test_task_vector(narrow_resnet):
     """The task vector reaches the network."""
     model = families.build(recipe("diffusion", "small", use_task_vector=True), made_stats(tasks=3), "cpu")
     model.policy.eval()

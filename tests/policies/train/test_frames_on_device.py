@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from transformers.initialization import no_init_weights
 
 from arena_newton.data import Frames
 from arena_newton.data.readers.label_protocols import encode_v4
@@ -297,7 +298,8 @@ def test_what_does_not_fit_is_refused(rows, monkeypatch):
 def test_memory_of_a_network_is_that_of_its_parameters(family):
     """The table has as many parameters as the paper's network."""
     paper = recipe(family, "paper", network={"pretrained_backbone_weights": None})
-    counted = sum(p.numel() for p in families.build(paper, made_stats(), "cpu").policy.parameters())
+    with no_init_weights():
+        counted = sum(p.numel() for p in families.build(paper, made_stats(), "cpu").policy.parameters())
     assert SIZES[family].parameters == pytest.approx(counted, rel=0.02)
 
 
@@ -346,7 +348,7 @@ def test_mutated_tables_are_refused_by_name(dataset, tmp_path, mutants):
     files = [copy / "meta" / "stats.json", copy / "meta" / "info.json", next((copy / "data").rglob("*.parquet"))]
     for file in files:
         sound = file.read_bytes()
-        for _ in range(mutants):
+        for _ in range(mutants // 2):
             file.write_bytes(damaged(sound, rng, text=file.suffix == ".json"))
             try:
                 found = read_rows(copy, "v4")
@@ -355,7 +357,7 @@ def test_mutated_tables_are_refused_by_name(dataset, tmp_path, mutants):
                 refused += 1
                 assert str(copy) in str(error)
         file.write_bytes(sound)
-    assert refused > mutants
+    assert refused > mutants // 2
 
 
 @pytest.mark.parametrize(

@@ -504,8 +504,10 @@ def test_start_from_weights(env, trained, still, tmp_path):
     second.critic_iterations = 2
     second.learn(2)
     for name, value in second.alg.get_policy().net.state_dict().items():
-        if name in weights:
-            torch.testing.assert_close(value, weights[name], atol=1e-4, rtol=1e-3)
+        if name.startswith("norm.") and name in weights:  # rounding next to the floor of a deviation
+            torch.testing.assert_close(value, weights[name], atol=1e-3, rtol=1e-3)
+        elif name in weights:
+            assert torch.equal(value, weights[name]), name
     assert any(not torch.equal(a, b) for a, b in zip(critic, second.alg.critic.parameters(), strict=True))
     second.learn(1)
     moved = [k for k, v in second.alg.get_policy().net.state_dict().items() if k in weights and (v != weights[k]).any()]
