@@ -101,11 +101,14 @@ def watched_worlds():
 
 
 @pytest.fixture(scope="session")
-def quick_worlds():
-    """Environments that all files share and whose episodes soon succeed."""
+def parts():
+    """Parts of runs in environments that all files share and whose episodes soon succeed."""
     from quick_worlds import QuickEnv
 
-    yield from keepers(QuickEnv)
+    from arena_newton.eval.play.run import Factories
+
+    for made in keepers(QuickEnv):
+        yield Factories(env=made)
 
 
 @pytest.fixture(scope="session")
