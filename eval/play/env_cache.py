@@ -55,5 +55,5 @@ class EnvCache:
         """Release the last environment: it is not needed any more, or what ran in it broke down."""
         if self._env is not None:
             self._env.end()
-        self._key = self._env = None
-        gc.collect()
+            self._key = self._env = None
+            gc.collect()

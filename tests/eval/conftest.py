@@ -1,5 +1,6 @@
 """Lets the tests of this folder import each other's stand-ins, and makes what several files read."""
 
+import gc
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -68,7 +69,8 @@ class Keepers(defaultdict):
         return self[task, said["tracker"].name, str(kind)](task, **said)
 
     def drop(self):
-        """Release all."""
+        """Release all; their memory goes with the process, which has too much of it to search for garbage."""
+        gc.freeze()
         for keeper in self.values():
             keeper.drop()
 
@@ -99,11 +101,14 @@ def watched_worlds():
 
 
 @pytest.fixture(scope="session")
-def quick_worlds():
-    """Environments that all files share and whose episodes soon succeed."""
+def parts():
+    """Parts of runs in environments that all files share and whose episodes soon succeed."""
     from quick_worlds import QuickEnv
 
-    yield from keepers(QuickEnv)
+    from arena_newton.eval.play.run import Factories
+
+    for made in keepers(QuickEnv):
+        yield Factories(env=made)
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ def by_copy(monkeypatch):
             lines = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)
             (folder / "episodes.jsonl").write_text("".join(lines[::-1]))  # as episodes happen to end
             change(folder)
-            return machines.RayRun(**({"code": 0, "killed_after": 1, "lost": 1, "said": "report"} | facts))
+            return machines.RayRun(**({"code": 0, "killed_after": 1, "lost": 1, "last_line": "report"} | facts))
 
         monkeypatch.setattr(machines, "play_by_ray", play)
 
@@ -138,7 +138,7 @@ def test_a_file_that_an_actor_did_not_write_fails(tmp_path, by_copy):
 @pytest.mark.parametrize(
     ("facts", "verdict", "said"),
     [
-        ({"code": 2, "said": "error: no Ray cluster"}, "fail", "ended with code 2: error: no Ray cluster"),
+        ({"code": 2, "last_line": "error: no Ray cluster"}, "fail", "ended with code 2: error: no Ray cluster"),
         ({"code": None}, "fail", "took longer than 60 min"),
         ({"killed_after": None, "lost": 0}, "note", "files of 2 Ray actors (6 episodes) are those"),
         ({"lost": 0}, "note", "files of 2 Ray actors (6 episodes) are those"),

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from made_signals import UNTOUCHED, WELL, signals
 from rows import episodes, full, record
 from test_report import document_of, folder_with
@@ -211,11 +212,8 @@ def test_figures_count_stages_and_what_was_seen(tmp_path):
     found = [record(row) for row in [*rows, *plain, rows[0] | {"index": 9, "repeat": 9, "outcome": "error"}]]
     (cell,) = failure_cells(found)
     assert (cell["episodes"], cell["successes"]) == (5, 2)
-    assert {name: count for name, count in cell["stages"].items() if count} == {
-        "perception": 1,
-        "approach": 1,
-        "recovery": 1,
-    }
+    counted = {name: count for name, count in cell["stages"].items() if count}
+    assert counted == {"perception": 1, "approach": 1, "recovery": 1}
     assert cell["falls"]["recovery"] == 1 and sum(cell["falls"].values()) == 1
     assert [(cell[key]["successes"], cell[key]["episodes"]) for key in ("seen", "unseen")] == [(1, 3), (1, 2)]
     assert failure_cells([record(row) for row in plain]) == []
@@ -368,10 +366,8 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
         assert few.verdict == verdict and f"recall of approach is {3 * times} of {4 * times}" in few.notes[0]
         assert ("too few episodes" in few.notes[0]) is (verdict == "note")
     assert any("recall of perception" in note for note in bad.notes)
-    agreed[0:6:2] = [
-        LabelledFailure(number, (FailureStage.CONTACT, FailureStage.POSTURE, FailureStage.CONTACT))
-        for number in (1, 3, 5)
-    ]
+    apart = (FailureStage.CONTACT, FailureStage.POSTURE, FailureStage.CONTACT)
+    agreed[0:6:2] = [LabelledFailure(number, apart) for number in (1, 3, 5)]
     unlike = failures(played(lambda body: OF[body] * 5))
     assert unlike.verdict == "fail" and "rules and reader 1 agree on 7 of 10 (all numbers)" in " ".join(unlike.notes)
     assert "1.00 rules with reader 2" in unlike.summary
@@ -390,9 +386,8 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
     found = failures(SimpleNamespace(**context))
     scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
     assert [(cell.task, cell.body) for cell in cells] == scripted
-    assert f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none" in " ".join(
-        found.notes
-    )
+    said = f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none"
+    assert said in " ".join(found.notes)
     for task, looked_at in TUNED.items():
         assert max(looked_at) < HELD_OUT
         said = f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on "
@@ -551,9 +546,8 @@ def test_a_misled_expert_sits_down_nowhere_or_without_weight(sofa):
         policy.reset([SEEDS[0]], ["sit_sofa"])
         heights[name] = float(policy.overrule(sitting).height[0])
     neutral = float(command.height[0])
-    assert {heights[name] for name in ("blinded", "misaimed", "reluctant")} == {neutral} and heights[
-        "unbalanced"
-    ] == pytest.approx(0.51)
+    assert {heights[name] for name in ("blinded", "misaimed", "reluctant")} == {neutral}
+    assert heights["unbalanced"] == pytest.approx(0.51)
     assert PERCHED[0] <= heights["clumsy"] == heights["stubborn"] <= PERCHED[1]
 
 
@@ -573,8 +567,6 @@ def test_a_weak_tracker_does_a_part_of_its_legs():
 
     class Seven(trackers.Tracker):
         def step(self, command, state):
-            import torch
-
             return torch.full((2, 29), 7.0)
 
     weak = WeakTracker(Seven(), 0.25)

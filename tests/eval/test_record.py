@@ -32,12 +32,6 @@ BRIEF = [*SMALL, "--policy", "stand", "--episodes", str(COUNT)]
 
 
 @pytest.fixture(scope="module")
-def parts(quick_worlds):
-    """Worlds of such episodes."""
-    return Factories(env=quick_worlds)
-
-
-@pytest.fixture(scope="module")
 def recorded(tmp_path_factory, kept_worlds):
     """A whole disturbed episode of boxing."""
     folder = tmp_path_factory.mktemp("recorded") / "whole"

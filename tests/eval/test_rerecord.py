@@ -11,15 +11,8 @@ import pytest
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, write_episode
 from arena_newton.data.recording.source_videos import source_looks
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.play.run import Factories
 
 CPU = ["--engine", "mujoco", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def parts(quick_worlds):
-    """Worlds whose episodes soon succeed."""
-    return Factories(env=quick_worlds)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
-from arena_newton.eval.play.run import Factories
 from arena_newton.eval.workers import shard_merge
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.rules import seeding
@@ -377,16 +376,15 @@ def test_a_full_disk_leaves_nothing(copied, monkeypatch, capsys):
 
 
 @pytest.mark.timeout(600)
-def test_a_real_run(tmp_path, quick_worlds):
+def test_a_real_run(tmp_path, parts):
     """On engine mujoco two shards with other numbers of worlds give one machine's bytes, with strips and films."""
     flags = ["--task", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "3", "--max-steps", "6"]
     flags += ["--policy", "expert", "--tracker", "twist2", "--strip", "--video", "--video-episodes", "1"]
     flags += ["--video-size", "64x48"]
-    real = Factories(env=quick_worlds)
-    assert main(["run", *flags, "--worlds", "2", "--out", str(tmp_path / "one")], real) == 0
+    assert main(["run", *flags, "--worlds", "2", "--out", str(tmp_path / "one")], parts) == 0
     for n in (1, 2):
         out = ["--worlds", "1", "--shard", f"{n}/2", "--out", str(tmp_path / f"s{n}")]
-        assert main(["run", *flags, *out], real) == 0
+        assert main(["run", *flags, *out], parts) == 0
     merge(shards(tmp_path)[:2], tmp_path / "m")
     merge([tmp_path / "one"], tmp_path / "alone")
     merged, alone = contents(tmp_path / "m"), contents(tmp_path / "alone")
@@ -401,11 +399,11 @@ def test_a_real_run(tmp_path, quick_worlds):
 
 
 @pytest.mark.timeout(300)
-def test_recorded_shards(tmp_path, quick_worlds):
+def test_recorded_shards(tmp_path, parts):
     """Two shards of a recording give the files of one machine's, which the merged folder counts as recorded."""
     flags = "--task boxing --episodes 3 --engine mujoco --size 64x64 --max-steps 4".split()
     for name, more in (("one", "--worlds 2"), ("s1", "--worlds 1 --shard 1/2"), ("s2", "--worlds 1 --shard 2/2")):
-        assert main(["record", *flags, *more.split(), "--out", str(tmp_path / name)], Factories(env=quick_worlds)) == 0
+        assert main(["record", *flags, *more.split(), "--out", str(tmp_path / name)], parts) == 0
     merge([tmp_path / "s1", tmp_path / "s2"], tmp_path / "m")
     names = sorted(str(path.relative_to(tmp_path / "one")) for path in (tmp_path / "one" / "episodes").rglob("*.*"))
     assert len(names) == 6
