@@ -30,12 +30,13 @@ from arena_newton.policies.train.frames.demonstration_rows import (
     statistics,
 )
 from arena_newton.policies.train.frames.feature_scaling import Stats
-from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_frames, made_statistics
+from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_device, fast_kernels, make_batches
 from benchmarks.bench_options import TrainingBenchOptions
+from benchmarks.made_frames import made_frames
 
 __all__ = ["READY", "WARM_STEPS", "SpeedFigure", "bench_recipe", "main"]
 
@@ -114,6 +115,7 @@ def _lerobot_steps(options: TrainingBenchOptions, settings: TrainingRecipe, devi
     datasets, stats = _read(options, settings)
     model = families.build(settings, stats, device, options.weights or None)
     root, camera, fps = datasets[0].root, datasets[0].camera, 50
+    cut = (settings.picture - settings.height) // 2
     config = model.policy.config
     deltas = {"action": [tick / fps for tick in config.action_delta_indices]}
     for key in (camera, "observation.state"):
@@ -134,6 +136,7 @@ def _lerobot_steps(options: TrainingBenchOptions, settings: TrainingRecipe, devi
         for batch in loader:
             if camera != CAMERA_KEY:
                 batch[CAMERA_KEY] = batch.pop(camera)
+            batch[CAMERA_KEY] = batch[CAMERA_KEY][..., cut : cut + settings.height, :]
             loss, _ = model.policy.forward(model.preprocess(batch))
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.policy.parameters(), settings.grad_clip)

@@ -16,7 +16,7 @@ import arena_newton
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.tasks import TaskSpec
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What the checks of a certification measure: on real worlds where it is about bodies, bits and pictures."""
+"""Measurements of the checks of a certification, of bodies, bits and pictures on real worlds."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -22,6 +22,8 @@ from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
 from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import ByRules
+from arena_newton.tasks import boxing
 
 SEEDS = [seeding.episode_seed(tasks.get("boxing").gym_id, 0, repeat) for repeat in range(300)]
 
@@ -250,7 +252,7 @@ def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
 
 
 def test_a_rate_at_the_ceiling_is_a_bound():
-    """Where no pair ends otherwise the bound is the exact one of none in n; where all do nothing is bounded."""
+    """If no pair ends otherwise the bound is the exact one of none in n; if all do, nothing is bounded."""
     low, high = agreement.bound_of_difference(0, 0, 280)
     assert high == pytest.approx(1.0 - 0.025 ** (1 / 280)) and low == -high and high < 0.0132
     assert agreement.bound_of_difference(5, 0, 5)[1] == 1.0
@@ -272,8 +274,9 @@ def test_engines_that_step_other_models_differ_at_once(tmp_path, monkeypatch):
     )
 
 
-def test_a_tiny_real_certification(tmp_path, kept_worlds):
-    """One task and tracker, one episode: the expert solves it, frozen legs do not, and the strips are on the page."""
+def test_a_tiny_real_certification(tmp_path, kept_worlds, monkeypatch):
+    """One task and tracker, one episode: the expert solves it, a gliding base does not, and strips are on the page."""
+    monkeypatch.setattr(boxing, "TASK", dataclasses.replace(boxing.TASK, steps=ByRules(paper=400, released=400)))
     flags = {"task": ("boxing",), "tracker": ("twist2",), "episodes": 1, "quick": True, "worlds": 1}
     options = CertifyOptions(out=str(tmp_path), checks=("gliding-base",), **flags)
     assert certify.run(options, Factories(env=kept_worlds)) == 0

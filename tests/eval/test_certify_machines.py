@@ -51,7 +51,7 @@ def wait_for(condition, seconds=20.0):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "it does not happen"
-        time.sleep(0.05)
+        time.sleep(0.01)
 
 
 def edit(path, old, new):
@@ -94,7 +94,7 @@ def test_a_merge_that_loses_a_line_fails(tmp_path, monkeypatch, name):
 
 
 def test_shards_that_are_not_merged_fail(tmp_path, monkeypatch):
-    """What a merge refuses is the finding, not a complaint about flags."""
+    """A merge that is refused is the finding, not a complaint about flags."""
 
     def refuse(*_, **__):
         raise InputError("episode 3 differs")
@@ -104,7 +104,7 @@ def test_shards_that_are_not_merged_fail(tmp_path, monkeypatch):
 
 
 def certified_refusal():
-    """What is written of it."""
+    """Text that is written of it."""
     said = "shards are not merged: episode 3 differs"
     return {"verdict": "fail", "summary": said, "tables": [], "notes": [], "pictures": []}
 
@@ -166,7 +166,7 @@ def test_without_ray_it_says_so(tmp_path, monkeypatch):
 
 def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     """Of the processes below a run the one that plays is killed, once an episode has ended and not before."""
-    monkeypatch.setattr(machines, "POLL", 0.05)
+    monkeypatch.setattr(machines, "POLL", 0.01)
     (tmp_path / "episodes.jsonl").write_text("")
     waits = "import time; time.sleep(60)"
     idle, plays = (f'(exec -a ray::RayActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
@@ -174,7 +174,7 @@ def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     try:
         wait_for(lambda: machines._actors(run.pid))
         assert len(machines._actors(run.pid)) == 1 and not (tmp_path / "gone").exists()
-        timer = threading.Timer(0.5, lambda: (tmp_path / "episodes.jsonl").write_text("{}\n{}\n"))
+        timer = threading.Timer(0.1, lambda: (tmp_path / "episodes.jsonl").write_text("{}\n{}\n"))
         timer.start()
         assert machines._kill_one(run, tmp_path) == 2
         wait_for((tmp_path / "gone").exists)

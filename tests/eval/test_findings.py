@@ -25,12 +25,6 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
-def cells(made_suite):
-    """Cells of a suite of known outcomes."""
-    return read_cells([made_suite])
-
-
-@pytest.fixture(scope="module")
 def counts(made_suite, tmp_path_factory):
     """Their counts, as `tables` writes them."""
     folder = tmp_path_factory.mktemp("counts")
@@ -94,7 +88,7 @@ def test_findings_follow_the_data(cells):
 
 
 def test_a_claim_that_fails_does_not_reproduce():
-    """Where in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
+    """If in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
     said = verdicts(findings_of(played_by(3)).values())
     assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
     assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"

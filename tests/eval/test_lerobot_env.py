@@ -40,7 +40,7 @@ def watched(monkeypatch, watched_worlds):
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT with random weights that sways about the standing action, saved as LeRobot saves policies."""
     torch.manual_seed(7)
     config = ACTConfig(
@@ -95,7 +95,7 @@ def as_it_is(batch):
 
 
 def evaluate(monkeypatch, checkpoint, out, task, *flags, episodes=2):
-    """What LeRobot's command line wrote of the first episodes."""
+    """Results that LeRobot's command line wrote of the first episodes."""
     arguments = [PLUGIN, "--env.type=arena_newton", f"--env.task={task}", "--env.engine=mujoco", "--env.device=cpu"]
     arguments += [f"--env.image_width={SIDE}", f"--env.image_height={SIDE}", f"--policy.path={checkpoint}"]
     arguments += ["--policy.device=cpu", f"--eval.n_episodes={episodes}", f"--eval.batch_size={episodes}", "--seed=0"]

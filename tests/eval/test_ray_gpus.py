@@ -31,7 +31,7 @@ def cluster(tmp_path_factory):
 
 
 def play(cluster, out, *flags):
-    """How many processes see which GPUs, and the episodes of a suite on engine warp."""
+    """Number of processes per GPU that they see, and the episodes of a suite on engine warp."""
     nodes, folder = cluster
     (folder / "suite.toml").write_text(SUITE.replace('"mujoco"', '"warp"'))
     (folder / "gpus.txt").unlink(missing_ok=True)
@@ -63,6 +63,7 @@ with in_cluster(()):
 """A program that asks for processes and says which GPUs they see."""
 
 
+@pytest.mark.release
 def test_each_process_sees_its_gpu():
     """Processes with a GPU each see GPU 0 and GPU 1; with half a GPU each two of four see the same one."""
     done = subprocess.run([sys.executable, "-c", CREW], capture_output=True, text=True, timeout=120)

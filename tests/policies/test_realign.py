@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.readers.label_protocols import V4, V4Decoder
+from arena_newton.data.readers.label_decoder import V4Decoder
+from arena_newton.data.readers.label_protocols import V4
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import V4Policy, measured_yaw
 from arena_newton.robot import g1
@@ -15,7 +16,7 @@ from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler
 RATE = 0.05
 """Fraction of the gap that is closed each tick, large so that a short episode shows it."""
 DRIFT = 0.001
-"""What the robot turns less than the policy's rate says each tick [rad]."""
+"""Turn per tick by which the robot lags behind the policy's rate [rad]."""
 
 
 def labels(rates):
@@ -53,7 +54,7 @@ class Turning(Policy):
 
 
 def test_the_measured_heading_is_that_of_the_state():
-    """Whatever roll and pitch are, all around."""
+    """Headings all around, for any roll and pitch."""
     wanted = torch.linspace(-3.1, 3.1, 9, dtype=torch.float64)
     assert torch.allclose(measured_yaw(state_of(wanted)), wanted, atol=1e-6)
 

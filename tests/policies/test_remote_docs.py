@@ -1,20 +1,20 @@
-"""What docs/policies.md says is so: its tables, its server, its policy in Python."""
+"""Statements of docs/policies.md hold: its tables, its server, its policy in Python."""
 
-import json
 import re
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from json_server import JsonHandler, JsonServer
 
 from arena_newton import policies, tasks
 from arena_newton.env import STAND_ACTION
 from arena_newton.policies import Observation
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK
 from arena_newton.policies.remote.arena_client import (
-    MAX_CHUNK,
     MAX_FAILURES,
     MAX_REPLY,
     ROBOT_TYPE,
@@ -81,7 +81,9 @@ def test_task_table():
 def test_numbers_in_the_text():
     """Limits, names and defaults are those of the code."""
     assert (
-        f"1 to {MAX_CHUNK} actions" in PLAIN and f"at most {MAX_REPLY >> 20} MiB" in PLAIN and TOKEN_VARIABLE in PLAIN
+        f"1 to {LONGEST_CHUNK} actions" in PLAIN
+        and f"at most {MAX_REPLY >> 20} MiB" in PLAIN
+        and TOKEN_VARIABLE in PLAIN
     )
     assert f"| {MAX_FAILURES} requests in a row" in PLAIN and f'`"{ROBOT_TYPE}"`' in PLAIN
     policy = RemotePolicy("http://host")
@@ -97,24 +99,17 @@ def test_request_tables():
     """Requests have the keys of the tables, and no others."""
     seen = {}
 
-    class Listen(BaseHTTPRequestHandler):
+    class Listen(JsonHandler):
         def do_POST(self):  # noqa: N802 (the name that http.server calls)
-            seen[self.path] = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(json.dumps({"action": STAND_ACTION.tolist()}).encode())
+            seen[self.path] = self.asked()
+            self.answer(200, {"action": STAND_ACTION.tolist()})
 
-        def log_message(self, *_):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Listen)
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
-    policy = RemotePolicy(f"http://127.0.0.1:{server.server_port}", timeout=5.0)
+    server = JsonServer(Listen)
+    policy = RemotePolicy(server.url, timeout=5.0)
     policy.reset([3], ["Isaac-Boxing"])
     assert policy.act(observation(1)).errors == {}
     policy.close()
-    server.shutdown()
-    server.server_close()
+    server.close()
     for route, body in seen.items():
         assert sorted(row[0] for row in table(f"`{route}`")) == sorted(body)
     picture = seen["/infer"]["observation"]["images"]["front"]

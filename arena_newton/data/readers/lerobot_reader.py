@@ -14,7 +14,8 @@ import numpy as np
 
 from arena_newton import tasks
 from arena_newton.data.readers.dataset_files import DatasetFiles
-from arena_newton.data.readers.label_protocols import LABELS, decode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
+from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH
@@ -140,8 +141,8 @@ class DatasetActions:
         if block is None:
             return found
         version = block.get("version") if isinstance(block, dict) else None
-        said = {"3.1": "v3.1", "v3.1": "v3.1", "4": "v4", "4.0": "v4", "v4": "v4"}.get(str(version))
-        if said != found:
+        declared = {"3.1": "v3.1", "v3.1": "v3.1", "4": "v4", "4.0": "v4", "v4": "v4"}.get(str(version))
+        if declared != found:
             raise InputError(
                 f"{self.where}: vla_protocol has version {str(version)[:40]!r}, robot_type {kind} is of {found}"
             )

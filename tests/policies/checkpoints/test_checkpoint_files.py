@@ -34,7 +34,7 @@ TRANSFORMS = {
         "pad": {"weight": 1.0, "type": "Pad", "kwargs": {"padding": [0, 8, 0, 8], "fill": 0}},
     },
 }
-"""What the original's training does to 640x480 pictures, at a size for tests."""
+"""Preparation of 640x480 pictures in the original's training, at a size for tests."""
 
 
 @pytest.fixture
@@ -283,7 +283,7 @@ CONSTANT = {
 @pytest.mark.parametrize("mode", CONSTANT)
 @pytest.mark.parametrize(("feature", "part"), [(STATE, "pre"), ("action", "post")])
 def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, feature, part):
-    """They make noise of every look, or one action of every answer; a feature of which one number changes is taken."""
+    """They make noise of every query, or one action of every answer; a feature of which one number changes is taken."""
     made, said = CONSTANT[mode]
     modes = {kind: mode for kind in ("VISUAL", "STATE", "ACTION", "ENV")} | {"VISUAL": "MEAN_STD"}
     edit(folder / "config.json", normalization_mapping=modes)
@@ -335,7 +335,7 @@ def test_damaged_files_raise_nothing_else(folder, mutants):
     draw, refused = random.Random(3), 0
     (folder / "train_config.json").write_text(json.dumps({"dataset": {"image_transforms": TRANSFORMS}}))
     sound = {path: path.read_bytes() for path in sorted(folder.glob("*.json"))}
-    for _ in range(2 * mutants):
+    for _ in range(mutants):
         path = draw.choice(list(sound))
         path.write_bytes(damaged(sound[path], draw, text=True))
         try:
@@ -343,7 +343,7 @@ def test_damaged_files_raise_nothing_else(folder, mutants):
         except InputError:
             refused += 1
         path.write_bytes(sound[path])
-    assert refused > mutants // 2
+    assert refused > mutants // 4
 
 
 def test_a_name_of_the_hub_that_is_not_here(tmp_path, monkeypatch, capsys):

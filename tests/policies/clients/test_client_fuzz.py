@@ -29,7 +29,7 @@ def broken(good, count, seed):
 
 
 def hand_made():
-    """What no random damage finds: other types in every place of an answer."""
+    """Damage that no random bytes find: other types in every place of an answer."""
     odd = [None, True, 7, -1.5, "text", b"bytes", [], {}, [[1.0] * 40], [[1] * 40, None], {"actions": 3}]
     odd += [np.zeros((0, 40)), np.zeros((40, 40, 40)), np.full((2, 40), np.inf), np.zeros((2, 40), bool)]
     odd += [np.zeros((3, 40), np.int64), np.zeros(40, np.float16), np.zeros((1, 0), np.float32)]
@@ -56,7 +56,7 @@ class Answering(SocketServer):
         self.replies = replies
         super().__init__(protocol, facts(needs_picture=False, picture=None))
 
-    def fail(self, socket, look):
+    def fail(self, socket, query):
         with self.lock:
             reply = self.replies.pop() if self.replies else None
         if reply is None:
@@ -64,8 +64,8 @@ class Answering(SocketServer):
         socket.send(reply)
         return True
 
-    def fault(self, look):
-        return "39"  # sends vla-eval's looks to `fail`, too
+    def fault(self, query):
+        return "39"  # sends vla-eval's queries to `fail`, too
 
 
 def drive(server, policy, count):
@@ -101,7 +101,7 @@ def test_broken_replies_are_an_error_of_their_world(protocol, mutants):
         good = vla_eval_codec.pack_action(ROWS, 3, 1.0)
         replies = [*broken(good, mutants, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
     server = Answering(protocol, list(replies))
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0, backoff=0.01)
+    policy = policies.get(f"remote:{server.url}", timeout=1.0, retries=0, backoff=0.01)
     policy.check()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     drive(server, policy, len(replies))

@@ -14,6 +14,7 @@ from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
 from arena_newton.policies.train import network_compiler, training
 from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families.act_family import ActModel
 from arena_newton.policies.train.policy_options import UNCOMPILED, PolicyTrainOptions
 from arena_newton.policies.train.training import train
 from tests.policies.train import narrow_network
@@ -87,7 +88,7 @@ def test_a_compiled_step_is_captured(dataset, tmp_path, compiler):
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name not in UNCOMPILED])
 def test_nearly_all_parameters_are_compiled(family):
-    """What a family has compiled holds nearly all parameters that learn, and keeps their names."""
+    """Compiled parts of a family hold nearly all parameters that learn, and keep their names."""
     model = families.build(recipe(family, "small"), made_stats(), "cpu")
     names = list(model.policy.state_dict())
     called = {id(p) for part in model.compiled_parts() for p in part.parameters()}
@@ -130,13 +131,15 @@ def test_a_missing_compiler_is_said_at_once(dataset, tmp_path, monkeypatch):
 
 
 def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, monkeypatch):
-    """What the compiler says is in one line of ours; errors of other kinds stay what they are."""
+    """A compiler's complaint is in one line of ours; errors of other kinds stay what they are."""
     broken = tmp_path / "g++"
     broken.write_text("#!/bin/sh\necho broken >&2\nexit 1\n")
     broken.chmod(0o755)
     monkeypatch.setenv("CXX", str(broken))
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, str(broken)))
     torch.compiler.reset()
+    # One layer is enough for a complaint.
+    monkeypatch.setattr(ActModel, "compiled_parts", lambda self: [self.policy.model.action_head])
     # A cache that other processes fill could spare this one the compiler, and a pool of processes be slow to start.
     own = fresh_cache(dir=str(tmp_path)), torch._inductor.config.patch(compile_threads=1)
     with own[0], own[1], pytest.raises(ArenaError, match="--compile: the network could not be compiled") as error:
