@@ -132,7 +132,8 @@ class SonicNet(TrackerNetwork):
         """Make layers with these hidden widths."""
         super().__init__()
         self.widths = tuple(encoder), tuple(decoder), latent
-        used = torch.cat([torch.arange(AT[name].start, AT[name].stop) for name in ENCODED])
+        # No `arange`: where weights are checked on the device "meta" it would import SymPy, which takes seconds.
+        used = torch.tensor([column for name in ENCODED for column in range(AT[name].start, AT[name].stop)])
         self.register_buffer("used", used, persistent=False)
         self.encoder_norm = InputNorm(len(used))
         self.decoder_norm = InputNorm(PROPRIOCEPTION)
