@@ -192,8 +192,11 @@ def tester(hint: object) -> Callable[[Json], bool]:
         return lambda v: isinstance(v, dict) and all(key(k) and value(x) for k, x in v.items())
     if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or typing.is_typeddict(hint)):
         tests, required = {key: test for key, (test, _) in _fields(hint).items()}, _required(hint)
+        more = typing.is_typeddict(hint)
         return lambda v: (
-            isinstance(v, dict) and required <= set(v) and all(tests[k](x) for k, x in v.items() if k in tests)
+            isinstance(v, dict)
+            and required <= set(v)
+            and all(tests[k](x) if k in tests else more for k, x in v.items())
         )
     return _PLAIN[hint]
 

@@ -146,6 +146,9 @@ def read_facts(content: object, where: str) -> ServedFacts:
         version = plain_text(content["arena"], 40)
         raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
     declared = {key: value for key, value in content.items() if value is not None}
+    if isinstance(picture := declared.get("picture"), Mapping):  # of later versions it may say more
+        known = ServedPicture.__dataclass_fields__
+        declared["picture"] = {key: value for key, value in picture.items() if key in known}
     try:
         facts = loaded(f"{where}: the server declares", declared, ServedFacts)
     except InputError as error:
