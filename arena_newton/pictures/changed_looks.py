@@ -263,7 +263,8 @@ def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> t
     second[0] &= first[0]
     second[1] &= ~first[1]
     which = first.long() * ~second + 2 * second.long()
-    return which.gather(0, kind.clamp_max(2)[None])[0] * (kind <= 3)
+    chosen: torch.Tensor = which.gather(0, kind.clamp_max(2)[None])[0] * (kind <= 3)
+    return chosen
 
 
 def _with_things(

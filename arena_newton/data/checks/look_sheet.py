@@ -35,14 +35,11 @@ def changed_rows(
         frames = np.stack([video.read(row // looks.stride) for row in rows])
     finally:
         video.close()
-    chances, objects = torch.from_numpy(looks.chances()), torch.from_numpy(looks.objects())
+    chances = torch.from_numpy(looks.chances()).expand(len(rows), -1)
+    objects = torch.from_numpy(looks.objects()).expand(len(rows), -1)
     number, seen = torch.arange(len(rows)), torch.from_numpy(np.stack(pictures))
     with torch.random.fork_rng([]):
         torch.manual_seed(len(rows))
-        changed = [
-            changed_looks(
-                seen, torch.from_numpy(frames), *(one.expand(len(rows), -1) for one in (chances, objects)), number
-            )
-            for _ in range(count)
-        ]
+        shown = torch.from_numpy(frames)
+        changed = [changed_looks(seen, shown, chances, objects, number) for _ in range(count)]
     return [list((255.0 * one).round().byte().numpy()) for one in changed]
