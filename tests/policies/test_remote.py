@@ -518,7 +518,7 @@ def test_https(server, certificate):
         policy.check()
     policy.close()
     server.behave = {1.0: "slow"}
-    policy = RemotePolicy(url, timeout=0.3, retries=0, verify_ssl=False)
+    policy = RemotePolicy(url, timeout=0.5, retries=0, verify_ssl=False)
     policy.check()
     for _ in range(2):
         start = time.monotonic()

@@ -84,9 +84,9 @@ def test_a_client_that_reads_nothing_is_hung_up_on(served, monkeypatch):
     monkeypatch.setattr(websocket_listener, "SEND_SECONDS", 0.2)
     one = served(talkative())
     deaf, _ = plain_socket(one.port)
-    frame = stuff(deaf)
-    deaf.settimeout(15)
     with pytest.raises(ConnectionError):
+        frame = stuff(deaf)
+        deaf.settimeout(15)
         while True:
             deaf.sendall(frame)
     deaf.close()
