@@ -13,8 +13,6 @@ from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
 
-MODES = ("base", "semantic", "visual", "all")
-
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -50,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     preview.add_argument("targets", nargs="*", metavar="TARGET", help="task names or USD layers; all tasks by default")
     preview.add_argument("--out", type=Path, default=Path("preview.png"), help="PNG to write")
     preview.add_argument("--size", type=int, default=320, help="width of one picture [px]")
-    preview.add_argument("--mode", choices=MODES, default="base", help="which look")
+    preview.add_argument("--mode", default="base", help="the look of a test mode (default: base), or all")
     return parser
 
 
@@ -76,6 +74,9 @@ def _validate(args: argparse.Namespace) -> int:
     from arena_newton.usd_scenes.validate import differences, task_of, validate
 
     files = args.files or [name for name in tasks.names() if tasks.get(name).layer.is_file()]
+    for name in tasks.names():
+        if name in files:
+            files += sorted(str(path) for path in (tasks.get(name).layer.parent / "variants").glob("*.usda"))
     wrong = 0
     for name in files:
         own_task = name if name in tasks.names() else None

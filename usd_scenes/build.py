@@ -6,6 +6,7 @@ from pathlib import Path
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.usd_scenes.patterns import PATTERNS
 from arena_newton.usd_scenes.textures import write_all
 
 __all__ = ["FOLDER", "build_all", "parts"]
@@ -36,6 +37,8 @@ def build_all(folder: Path = FOLDER, names: Sequence[str] = ()) -> list[Path]:
         target.mkdir(parents=True, exist_ok=True)
         if name == "textures":
             write_all(target)
+            for mode, patterns in PATTERNS.items():
+                write_all(target / mode, patterns)
             written.append(target)
         elif name == "g1":
             path = target / "g1.usda"
