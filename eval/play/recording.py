@@ -49,7 +49,7 @@ def facts_of(
 ) -> JsonObject:
     """Facts about the run in an episode's file: all that its bytes depend on, and no time, folder or number of worlds.
 
-    Only what concerns the episode's own task, tracker and mode, so that its bytes do not depend on what else was played.
+    Only what concerns the episode's own task, tracker and mode: its bytes do not depend on what else was played.
     """
     identity, flags = config.identity(), config.flags
     left_out = (

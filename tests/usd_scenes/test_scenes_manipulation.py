@@ -11,6 +11,7 @@ from arena_newton.errors import InputError
 from arena_newton.physics.scene import Scene, load_scene
 from arena_newton.usd_scenes import author, rooms
 from arena_newton.usd_scenes.build import FOLDER, build_all
+from arena_newton.usd_scenes.patterns import PATTERNS
 from arena_newton.usd_scenes.textures import TEXTURES, write_all
 
 SCENES = tuple(name for name in tasks.names() if tasks.get(name).suite == "HOI")
@@ -239,7 +240,7 @@ def test_textures_are_small(tmp_path):
     """Every texture is at most 256 pixels wide and high and 32 KiB long."""
     from PIL import Image
 
-    for path in write_all(tmp_path):
+    for path in (path for patterns in (TEXTURES, *PATTERNS.values()) for path in write_all(tmp_path, patterns)):
         assert max(Image.open(path).size) <= 256
         assert path.stat().st_size <= 32 * 1024
 
