@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     preview.add_argument("targets", nargs="*", metavar="TARGET", help="task names or USD layers; all tasks by default")
     preview.add_argument("--out", type=Path, default=Path("preview.png"), help="PNG to write")
     preview.add_argument("--size", type=int, default=320, help="width of one picture [px]")
-    preview.add_argument("--mode", default="base", help="the look of a test mode (default: base), or all")
+    preview.add_argument("--mode", nargs="+", default=[], help="looks of test modes (default: base), or all")
     return parser
 
 
@@ -120,7 +120,7 @@ def _preview(args: argparse.Namespace) -> None:
     for target in args.targets:
         if target not in tasks.names():
             check_files(target)
-    print(preview(args.targets or list(tasks.names()), args.out, args.size, args.mode))
+    print(preview(args.targets or list(tasks.names()), args.out, args.size, *args.mode))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -53,7 +53,7 @@ def _stones(count: int, colors: Sequence[Color], joint: Color, width: float) -> 
     """Irregular pieces around drawn points in joints of `width` [px]: stained glass, paving, terrazzo."""
     rng = generator(f"stones {count} {colors[0]}")
     points = rng.random((count, 2)) * SIDE
-    away = np.abs(np.stack(np.mgrid[0:SIDE, 0:SIDE], axis=-1)[:, :, None] - points)
+    away = np.abs(np.indices((SIDE, SIDE)).transpose(1, 2, 0)[:, :, None] - points)
     distance = np.linalg.norm(np.minimum(away, SIDE - away), axis=-1)
     first, second = np.sort(distance, axis=-1)[..., :2].transpose(2, 0, 1)
     image = np.array(colors, dtype=np.uint8)[np.argmin(distance, axis=-1) % len(colors)]

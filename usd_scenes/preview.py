@@ -33,7 +33,7 @@ _LABEL = 18
 _GAP = 4
 
 
-def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") -> Path:
+def preview(targets: list[str], out: Path, size: int = 320, *modes: str) -> Path:
     """Render a contact sheet: one row per target and mode, ego view left, world view right.
 
     Objects are where the file puts them, dropped until they rest; the robot is held in its spawn pose.
@@ -42,7 +42,7 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
         targets: Task names or scene files.
         out: PNG to write.
         size: Width of the head camera's picture [px]; the other view has the same height.
-        mode: One of `MODES`, or all for all of them.
+        *modes: Some of `MODES`, or all for all of them; base when none is given.
 
     Returns:
         The path of the PNG.
@@ -50,17 +50,18 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
     Raises:
         InputError: Unknown mode, size, or a target that is not a scene.
     """
-    if mode != "all" and mode not in MODES:
-        raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
+    for mode in modes:
+        if mode != "all" and mode not in MODES:
+            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
     if size < 16:
         raise InputError(f"--size {size}: expected at least 16 pixels")
     height = round(size / _VIEWS[0][1])
-    modes = MODES if mode == "all" else (mode,)
+    shown = MODES if "all" in modes else modes or ("base",)
     rows = [
         (f"{target} | {name}", _views(target, height, name))
         for target in targets
-        for name in modes
-        if mode == name or target in tasks.names() or name not in rule_types.HELD_OUT
+        for name in shown
+        if "all" not in modes or target in tasks.names() or name not in rule_types.HELD_OUT
     ]
     widths = [round(height * aspect) for _, aspect in _VIEWS]
     area = (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows))
