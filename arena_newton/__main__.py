@@ -42,7 +42,7 @@ COMMANDS = (
     Command("policies teleop", "arena_newton.policies.teleop.__main__", "a person drives: browser, redis"),
     Command("policies train", "arena_newton.policies.train.__main__", "train a policy on demonstrations; teachable"),
     Command("rules", "arena_newton.rule_sets", "print both rule sets"),
-    Command("scenes", "arena_newton.usd_scenes.__main__", "build, validate, list, preview or begin (new) USD scenes"),
+    Command("scenes", "arena_newton.usd_scenes.__main__", "validate, list, preview or begin (new) USD scenes"),
     Command("train", "arena_newton.trackers.train.__main__", "short for trackers train"),
     Command("trackers check", "arena_newton.trackers.tracker_check", "try what the interface promises on a tracker"),
     Command("trackers evaluate", "arena_newton.trackers.evaluate", "measure trackers side by side"),
@@ -106,11 +106,11 @@ def _run(arguments: list[str]) -> int:
 
 def _rules(arguments: list[str]) -> int:
     if arguments:
-        said = "takes no arguments; it prints both rule sets as Markdown"
+        text = "takes no arguments; it prints both rule sets as Markdown"
         if {*arguments} & {"-h", "--help"}:
-            print(f"usage: {PROG} rules\n\nrules {said}.")
+            print(f"usage: {PROG} rules\n\nrules {text}.")
             return 0
-        raise InputError(f"rules {arguments[0]}: {said}")
+        raise InputError(f"rules {arguments[0]}: {text}")
     from arena_newton import rule_sets
 
     print(rule_sets.markdown(), end="")

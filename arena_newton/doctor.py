@@ -67,7 +67,7 @@ _TORCHCODEC_MEMORY = 8 << 30
 """Memory that loading torchcodec may take beyond the interpreter's own [bytes]; it loads torch."""
 _TORCHCODEC_TIME = 60.0
 """Time that it may take [s]; 3 s on an idle machine."""
-_SAID = 120
+_LONGEST = 120
 """Characters of its complaint that are shown, up to the end of a sentence."""
 _INSTALL = "run `uv sync` in the checkout, or `pip install --upgrade arena-newton`"
 _MIN_FREE_GIB = 2.0
@@ -148,10 +148,10 @@ def _torchcodec() -> Finding:
         "LeRobot then reads videos with PyAV, 2 to 4 times slower: install FFmpeg's shared libraries, "
         "`apt install ffmpeg`"
     )
-    said = " ".join(fault.split())
-    if len(said) > _SAID:
-        said = said[:_SAID].rpartition(". ")[0] or said[:_SAID]
-    return Finding("torchcodec", f"does not load ({said})", "note", advice)
+    text = " ".join(fault.split())
+    if len(text) > _LONGEST:
+        text = text[:_LONGEST].rpartition(". ")[0] or text[:_LONGEST]
+    return Finding("torchcodec", f"does not load ({text})", "note", advice)
 
 
 def _devices() -> list[Finding]:
@@ -237,7 +237,7 @@ def _scenes() -> list[Finding]:
     findings = []
     for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in tasks.names())):
         if not (root / name).is_file():
-            advice = "run `python -m arena_newton.usd_scenes build`"
+            advice = "install again, or run `python -m scene_builders` in a checkout"
             findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
     return findings or [Finding("scenes", f"robot and all tasks in {root}")]
 

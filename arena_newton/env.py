@@ -306,6 +306,7 @@ class ArenaEnv:
             task=self.spec.name,
             gym_id=self.spec.gym_id,
             instruction=self.spec.instruction,
+            tracker=self.tracker.name,
         )
 
     def render(self, camera: Camera, mask: np.ndarray | None = None) -> torch.Tensor:
@@ -353,9 +354,9 @@ class ArenaEnv:
             raise InputError("no world runs an episode: call reset() first")
         self._anchor(stepping)
         self.loop.action.copy_(action)
-        settling = stepping & (self.tick < 0)
-        if settling.any():
-            self.loop.action[torch.from_numpy(settling).to(self.torch_device)] = self._stand
+        starting = stepping & (self.tick < 0)
+        if starting.any():
+            self.loop.action[torch.from_numpy(starting).to(self.torch_device)] = self._stand
         self.loop.tick(self.loop.action, stepping)
         self.physics.set_active(stepping)
         self.physics.step()
@@ -367,7 +368,7 @@ class ArenaEnv:
             self._judge_some()
         self.tick[stepping] += 1
         status = np.where(stepping, self._statuses(), kernels.RUNNING).astype(np.int32)
-        early = settling & ((status == kernels.SUCCESS) | (status > kernels.EVENT))
+        early = starting & ((status == kernels.SUCCESS) | (status > kernels.EVENT))
         if early.any():
             status[early] = np.where(self._fallen.numpy()[early] != 0, kernels.FALL, kernels.RUNNING)
         return status

@@ -63,6 +63,8 @@ class Observation:
     """The original benchmark's task id (sent to policy servers)."""
     instruction: str
     """Natural-language instruction."""
+    tracker: str = ""
+    """Name of the tracker that executes the actions; empty: not known."""
 
 
 @dataclass

@@ -53,7 +53,7 @@ def ending(env: World, code: int, tick: int, budget: int) -> tuple[str, str, str
 
     Args:
         env: The worlds.
-        code: What `env.step` said of the episode's world.
+        code: Code of `env.step` for the episode's world.
         tick: Ticks since its step 0, the one that ended now included; negative in the start-up.
         budget: Its step budget [ticks].
     """
@@ -99,8 +99,8 @@ class Rollout:
             recorder: One recorder or several, which are called in their order.
             disturbance: Makes the executed actions of a tick from the policy's; recorders see the policy's.
             max_steps: Step budget instead of the rule set's [ticks].
-            latency: Ticks from a policy's look to the first action of its chunk. Meanwhile the chunk before goes on, so
-                that the policy looks again when so many actions of it are left; in an episode's first ticks the robot
+            latency: Ticks from a policy's query to the first action of its chunk. Meanwhile the chunk before goes on:
+                the policy is queried again when so many actions of it are left; in an episode's first ticks the robot
                 stands.
             spawn: The robot's pose at a reset instead of the task's spawn pose.
             samples: Samples of the objects' poses of an episode instead of those that its seed draws.

@@ -111,7 +111,9 @@ def _light_text(rules: RuleSet) -> str:
 
 def text(rules: RuleSet) -> str:
     """A rule set as it is printed, one line per row."""
-    return "\n".join([f"rules {rules.name} ({rules.hash})", *(f"  {item}: {said}" for item, said in table(rules))])
+    return "\n".join(
+        [f"rules {rules.name} ({rules.hash})", *(f"  {item}: {message}" for item, message in table(rules))]
+    )
 
 
 def table(rules: RuleSet) -> list[tuple[str, str]]:
@@ -135,9 +137,9 @@ def table(rules: RuleSet) -> list[tuple[str, str]]:
             if paper
             else "ranges as the released configuration has them",
         ),
-        *((f"semantic {task}", said) for task, said in _mode_notes(rules, "semantic")),
+        *((f"semantic {task}", message) for task, message in _mode_notes(rules, "semantic")),
         ("lights", _light_text(rules)),
-        *((f"{task} in visual mode", said) for task, said in _mode_notes(rules, "visual")),
+        *((f"{task} in visual mode", message) for task, message in _mode_notes(rules, "visual")),
         ("start-up before step 0", _startup_text(rules.startup)),
         (
             "drive of official TWIST2 checkpoints",

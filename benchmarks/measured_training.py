@@ -114,6 +114,7 @@ def _lerobot_steps(options: TrainingBenchOptions, settings: TrainingRecipe, devi
     datasets, stats = _read(options, settings)
     model = families.build(settings, stats, device, options.weights or None)
     root, camera, fps = datasets[0].root, datasets[0].camera, 50
+    cut = (settings.picture - settings.height) // 2
     config = model.policy.config
     deltas = {"action": [tick / fps for tick in config.action_delta_indices]}
     for key in (camera, "observation.state"):
@@ -134,6 +135,7 @@ def _lerobot_steps(options: TrainingBenchOptions, settings: TrainingRecipe, devi
         for batch in loader:
             if camera != CAMERA_KEY:
                 batch[CAMERA_KEY] = batch.pop(camera)
+            batch[CAMERA_KEY] = batch[CAMERA_KEY][..., cut : cut + settings.height, :]
             loss, _ = model.policy.forward(model.preprocess(batch))
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.policy.parameters(), settings.grad_clip)

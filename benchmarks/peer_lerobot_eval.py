@@ -130,7 +130,7 @@ def _timed(name: str, command: Sequence[str], allowed: Sequence[int]) -> float:
     )
     seconds = time.perf_counter() - began
     if done.returncode not in allowed:
-        said = [line.strip() for line in done.stdout.splitlines() if line.strip()]
-        last = said[-1][:300] if said else "it said nothing"
+        lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+        last = lines[-1][:300] if lines else "it printed nothing"
         raise ArenaError(f"{name} ended with code {done.returncode}: {last}")
     return seconds

@@ -115,8 +115,8 @@ class MjlabTraining:
         finally:
             too_late.cancel()
         self._process.wait()
-        said = [line.strip() for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
-        last = said[-1][:300] if said else "it said nothing"
+        lines = [line.strip() for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        last = lines[-1][:300] if lines else "it printed nothing"
         raise ArenaError(f"mjlab ended with code {self._process.returncode}: {last}")
 
     def close(self) -> None:
@@ -164,8 +164,8 @@ def tracker_training_figures(options: PeerOptions) -> Iterator[BenchFigure]:
             yield PAIR.missing(label, "not measured: name an interpreter that has mjlab by --mjlab-python")
             continue
         rounds, mjlab = _rounds(options, worlds, "cuda:0" if cuda else "cpu")
-        said = ", ".join(f"{one} {version}" for one, version in mjlab.versions.items())
-        notes = [f"peer: {said}, {mjlab.physics}"]
+        text = ", ".join(f"{one} {version}" for one, version in mjlab.versions.items())
+        notes = [f"peer: {text}, {mjlab.physics}"]
         yield PAIR.judge(options, label, rounds, unjudged=on_cpu(cuda), notes=notes, peer_versions=mjlab.versions)
 
 

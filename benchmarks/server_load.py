@@ -20,10 +20,10 @@ from arena_newton.interfaces import Chunk, Observation
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Policy
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
-from arena_newton.policies.protocols.policy_messages import Look
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.protocols.policy_messages import Query
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION, STATE_WIDTH
 from benchmarks.bench_options import ServerBenchOptions
@@ -87,8 +87,10 @@ def _serve(protocol: str, clients: int, parent: Connection) -> None:
     """Serve until the parent says so; then answer with the largest memory [GiB]."""
     server = PolicyServer(StandingPolicy(), max_sessions=clients + 4)
     server.start()
-    door = open_door(server, ServeOptions(policy="stand", protocol=protocol, port=0), DoorGuard(clients + 8, ""))
-    parent.send(door.port)
+    endpoint = open_endpoint(
+        server, ServeOptions(policy="stand", protocol=protocol, port=0), ConnectionGuard(clients + 8, "")
+    )
+    parent.send(endpoint.port)
     parent.recv()
     status = Path("/proc/self/status").read_text()
     parent.send(next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 2**20)
@@ -117,9 +119,9 @@ def _ask(
     """Play clients, each in a thread, and send the times of their answers."""
     state = np.zeros(STATE_WIDTH, np.float32)
     state[[0, 3]] = 1.0
-    look = Look(state, np.zeros(shape, np.uint8), task="boxing", instruction="Box.")
+    query = Query(state, np.zeros(shape, np.uint8), task="boxing", instruction="Box.")
     openpi = protocol == "openpi"
-    body = openpi_codec.pack_request(look) if openpi else vla_eval_codec.pack_request(look, 1, 0.0)
+    body = openpi_codec.pack_request(query) if openpi else vla_eval_codec.pack_request(query, 1, 0.0)
     times: list[float] = []
 
     def client() -> None:

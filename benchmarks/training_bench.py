@@ -58,7 +58,7 @@ def training_figures(options: TrainingBenchOptions) -> Iterator[BenchFigure]:
     judged = "H200" in name and settings.family == "act" and settings.batch_size == 64 and settings.name != "small"
     source = ", ".join(str(one) for one in options.dataset) or f"{options.frames} made-up pictures"
     about = f"{settings.family}/{settings.name}, batch {settings.batch_size}"
-    facts = f"{settings.precision}, {settings.picture}x{settings.picture} pixels, {source}, on {name}"
+    facts = f"{settings.precision}, {settings.picture}x{settings.height} pixels, {source}, on {name}"
     alone = None
     for count in options.trainings:
         found = measure(options, count)

@@ -52,7 +52,7 @@ COMMANDS = {
     ),
     "adversary": CommandRow("search the placement at which a policy does worst"),
     "bench": CommandRow("measure this machine against the figures to reach"),
-    "doors": CommandRow("one checkpoint through lerobot-eval and each served protocol, compared"),
+    "protocols": CommandRow("one checkpoint through lerobot-eval and each served protocol, compared"),
     "certify": CommandRow("prove the benchmark: checks, a certificate, an exit code"),
 }
 """By name, as the overview lists them."""

@@ -25,7 +25,7 @@ def read_by(policy: Policy, labels: str, late: int = 0) -> Policy:
     Args:
         policy: Whose actions are of `labels`.
         labels: Name of the protocol.
-        late: Ticks from a look to the first action of its chunk, as `rollout.Rollout` delays them.
+        late: Ticks from a query to the first action of its chunk, as `rollout.Rollout` delays them.
 
     Returns:
         The policy itself where it answers v3.1, else one that decodes its chunks.
@@ -50,7 +50,7 @@ class V4Policy(Policy):
     """Decodes the v4 actions of another policy per world; an episode's heading is that of its own start.
 
     A chunk must be executed to its end before the next one is asked for, as `rollout.Rollout` does. Where the policy
-    has a `realign`, the heading is measured whenever it looks.
+    has a `realign`, the heading is measured at each query.
     """
 
     labels = "v3.1"
@@ -60,7 +60,7 @@ class V4Policy(Policy):
 
         Args:
             policy: The policy.
-            late: Ticks from a look to the first action of its chunk.
+            late: Ticks from a query to the first action of its chunk.
         """
         self.policy, self._late = policy, late
         self.name = policy.name
@@ -109,9 +109,9 @@ class V4Policy(Policy):
         if self._decoder is None:  # used without an environment, as a policy server does
             self._decoder = V4Decoder(worlds, actions.device, realign=self._realign, late=self._late)
         if self._realign:
-            # A policy that gives a chunk in pieces looks at the first one only; which those are depends on others.
-            looked = getattr(self.policy, "looked", None)
-            measured = observation.mask if looked is None else observation.mask & looked
+            # Chunks in pieces are queried for the first piece only, and when that is depends on other worlds.
+            queried = getattr(self.policy, "queried", None)
+            measured = observation.mask if queried is None else observation.mask & queried
             self._decoder.measure(measured_yaw(observation.state), measured)
         return Chunk(self._decoder.decode(actions, observation.mask), answer.errors, answer.phases)
 

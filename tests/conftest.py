@@ -1,4 +1,4 @@
-"""What all tests share: reference material, scenes that are built once per session, and a small heap to collect."""
+"""Fixtures of all tests: reference material, scenes that are built once per session, and a small heap to collect."""
 
 import gc
 import os
@@ -15,7 +15,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-import benchmarks  # noqa: E402, F401  before the package takes the root of a checkout off the path
+# Before the package takes the root of a checkout off the path.
+import benchmarks  # noqa: E402, F401
+import scene_builders  # noqa: E402, F401
 
 sys.path.remove(str(ROOT))
 SHARED = Path(os.environ.get("ARENA_REFERENCE", ROOT.parent / "shared"))
@@ -58,14 +60,6 @@ def shared() -> Path:
     if not (SHARED / "reference").is_dir():
         pytest.skip(f"needs reference material, and {SHARED} has none; ARENA_REFERENCE names another folder")
     return SHARED
-
-
-@pytest.fixture(scope="session", autouse=True)
-def power():
-    """No test takes it away: nobody waits for a disk, which takes milliseconds a line of a journal."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: None)
-        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

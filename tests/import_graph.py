@@ -24,11 +24,12 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 PACKAGE = "arena_newton"
-BENCHMARKS = "benchmarks"
-"""Measurements outside of the package: they import everything, and nothing imports them."""
-ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4, BENCHMARKS: 6}
+OUTSIDE = ("benchmarks", "scene_builders")
+"""Folders next to the package, for work in a checkout: they import it, and nothing in it imports them."""
+ROOMS = {"kernels": 0, "usd_scenes": 1, PACKAGE: 1, "trackers": 2, "policies": 3, "eval": 4}
+ROOMS |= dict.fromkeys(OUTSIDE, 6)
 """Folder → level; a module imports from its own level and from those below. Scenes are next to the world: the world
-reads their files with their checks, their authors load a scene to look at it."""
+reads their files with their checks, which load a scene to look at it."""
 INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
         | certification studies loop bench | commands | __main__""",
@@ -97,7 +98,7 @@ def modules(root: Path) -> dict[str, Module]:
             parts = path.relative_to(root).with_suffix("").parts
             if room == PACKAGE and len(parts) > 1 and parts[1] in ROOMS:
                 continue  # the link to another room
-            parts = parts if parts[0] in (PACKAGE, BENCHMARKS) else (PACKAGE, *parts)
+            parts = parts if parts[0] in (PACKAGE, *OUTSIDE) else (PACKAGE, *parts)
             name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
             text = path.read_text(encoding="utf-8")
             found[name] = Module(name, path, ast.parse(text))
@@ -208,7 +209,8 @@ def upward_rooms(edges: list[Import]) -> list[Import]:
 
 SPLIT = (PACKAGE, f"{PACKAGE}.data", *(f"{PACKAGE}.{room}" for room in ("trackers", "policies", "eval")))
 """Folders of which a picture shows the parts."""
-COLOURS = dict(zip(ROOMS, ("#8d6e63", "#c0a030", "#2e7d32", "#1565c0", "#6a1b9a", "#37474f", "#546e7a"), strict=True))
+_SHADES = "#8d6e63 #c0a030 #2e7d32 #1565c0 #6a1b9a #37474f #546e7a #b08a50".split()
+COLOURS = dict(zip(ROOMS, _SHADES, strict=True))
 """Colour of each top-level folder in a picture."""
 
 

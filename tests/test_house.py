@@ -18,8 +18,8 @@ from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
 from arena_newton.eval.records.identity import UNHASHED
 from tests.import_graph import (
-    BENCHMARKS,
     INNER,
+    OUTSIDE,
     PACKAGE,
     Import,
     Module,
@@ -76,8 +76,9 @@ MOST_LINES = 600
 MOST_FILES = 20
 STEMS = {
     "base": "the base class of a room's kind of thing",
-    "build": "every scene has its builder",
-    **dict.fromkeys(tasks.names(), "a task and its expert"),
+    **dict.fromkeys(tasks.names(), "a task, its expert and the builder of its scene"),
+    "g1": "the robot, and the builder of its layer",
+    "lab": "the worlds of the tracker suite, and the builder of their scene",
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",
     "canonical": "the layout, and its kernels",
 }
@@ -178,7 +179,7 @@ def test_private_names_stay_at_home():
     found = []
     for module in known().values():
         for statement, _ in statements(module.tree):
-            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, BENCHMARKS)):
+            if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith((PACKAGE, *OUTSIDE)):
                 names = [a.name for a in statement.names if private(a.name)]
                 found += [f"{place(module, statement.lineno)}: {statement.module}.{name}" for name in names]
         # Attributes that the file sets, methods that it defines: its own, on whatever they are read.
@@ -189,7 +190,7 @@ def test_private_names_stay_at_home():
         for statement, _ in statements(module.tree):
             source = statement.module or "" if isinstance(statement, ast.ImportFrom) else ""
             for alias in statement.names:
-                if not (source or alias.name).startswith((PACKAGE, BENCHMARKS)):
+                if not (source or alias.name).startswith((PACKAGE, *OUTSIDE)):
                     strangers.add((alias.asname or alias.name).split(".")[0])
         inherited = {"_replace", "_asdict"}
         for node in module.nodes:
@@ -252,7 +253,8 @@ def tops(statement: ast.Import | ast.ImportFrom) -> set[str]:
 
 def test_heavy_imports_stand_at_the_top():
     """Only what a `--help` or a plan loads imports heavy libraries late; it imports none at its top."""
-    found, lights = [], loaded(f"{BENCHMARKS}.__main__", *(f"{PACKAGE}.{start}" for start in STARTS + PLANNING))
+    starts = [f"{top}.__main__" for top in OUTSIDE] + [f"{PACKAGE}.{start}" for start in STARTS + PLANNING]
+    found, lights = [], loaded(*starts)
     for module in known().values():
         for statement, late in statements(module.tree):
             for name in sorted(tops(statement) & HEAVY):
@@ -286,9 +288,9 @@ def test_what_is_imported_is_a_dependency():
     names |= {"zmq": "pyzmq", "sklearn": "scikit-learn", "huggingface_hub": "huggingface-hub"}
     names |= {"mujoco_warp": "mujoco-warp", "rsl_rl": "rsl-rl-lib"}
     # rsl-rl's own interface is made of tensordicts: whichever it brings is the right one.
-    allowed = {*sys.stdlib_module_names, "_typeshed", PACKAGE, BENCHMARKS, "tensordict"}
+    allowed = {*sys.stdlib_module_names, "_typeshed", PACKAGE, *OUTSIDE, "tensordict"}
     # Run by the interpreter of that other program, never imported.
-    theirs = {f"{BENCHMARKS}.mjlab_training": {"mjlab"}}
+    theirs = {"benchmarks.mjlab_training": {"mjlab"}}
     found = []
     for module in known().values():
         for node in module.nodes:
@@ -310,7 +312,7 @@ def test_what_no_run_is_known_by_moves_nothing():
     found = []
     for edge in [*edges(), *imports(known(), checking=True)]:
         file = known()[edge.source].path
-        if unhashed(edge.source) or file.name == "__main__.py" or edge.source.startswith(BENCHMARKS):
+        if unhashed(edge.source) or file.name == "__main__.py" or edge.source.startswith(OUTSIDE):
             continue
         # A command line by another name; no run imports it.
         if edge.source != f"{PACKAGE}.trackers.evaluate" and (reached := unhashed(edge.target) - {f"{PACKAGE}.pages"}):

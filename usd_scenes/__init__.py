@@ -1,1 +1,1 @@
-"""USD scenes: the authors that write the `.usda` layers, their validator, and the layers themselves."""
+"""USD scenes: the `.usda` layers and their validator."""

@@ -1,4 +1,4 @@
-"""`python -m arena_newton.usd_scenes {new,build,validate,list,preview}`.
+"""`python -m arena_newton.usd_scenes {new,validate,list,preview}`.
 
 Argparse, not tyro: `--spawn`, `--no-spawn` and neither are three cases, for which tyro would ask `--spawn True`, and it
 draws its complaints as a box.
@@ -11,12 +11,11 @@ from pathlib import Path
 
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.quiet import quiet_warp
-from arena_newton.errors import InputError
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m arena_newton.usd_scenes", description="Author, check and look at the USD scenes."
+        prog="python -m arena_newton.usd_scenes", description="Begin, check and look at USD scenes."
     )
     commands = parser.add_subparsers(dest="command", required=True)
 
@@ -24,11 +23,6 @@ def _parser() -> argparse.ArgumentParser:
     new.set_defaults(run=_new)
     new.add_argument("task", metavar="TASK", help="the task")
     new.add_argument("file", type=Path, metavar="FILE", help="the .usda file to write, anywhere")
-
-    build = commands.add_parser("build", help="write textures, robot and scenes from their authors")
-    build.set_defaults(run=_build)
-    build.add_argument("names", nargs="*", metavar="NAME", help="textures, g1 or a task; all by default")
-    build.add_argument("--out", type=Path, default=None, help="folder to build into (default: the project's own)")
 
     validate = commands.add_parser("validate", help="name everything wrong with scene or variant files")
     validate.set_defaults(run=_validate)
@@ -52,16 +46,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _build(args: argparse.Namespace) -> None:
-    from arena_newton.usd_scenes.build import FOLDER, build_all
-
-    try:
-        paths = build_all(args.out or FOLDER, args.names)
-    except OSError as error:
-        raise InputError(f"--out {args.out or FOLDER}: cannot be written ({error.strerror})") from error
-    print(*paths, sep="\n")
-
-
 def _new(args: argparse.Namespace) -> None:
     from arena_newton.usd_scenes.skeleton import write
 
@@ -70,7 +54,6 @@ def _new(args: argparse.Namespace) -> None:
 
 def _validate(args: argparse.Namespace) -> int:
     from arena_newton import tasks
-    from arena_newton.usd_scenes.build import FOLDER
     from arena_newton.usd_scenes.validate import differences, task_of, validate
 
     files = args.files or [name for name in tasks.names() if tasks.get(name).layer.is_file()]
@@ -83,7 +66,7 @@ def _validate(args: argparse.Namespace) -> int:
         path = tasks.get(name).layer if own_task else Path(name)
         problems, notes = validate(path, args.task or own_task), []
         task = args.task or (None if problems else task_of(path))
-        own = path.resolve().is_relative_to(FOLDER.resolve())
+        own = path.resolve().is_relative_to(tasks.base.SCENES.resolve())
         if not problems and task is not None:
             if not own:
                 notes = [f"{path}: changed: {sentence}" for sentence in differences(path, task)]

@@ -62,14 +62,14 @@ class _Announcing:
 
     def __init__(self) -> None:
         """Announce each of `LIBRARIES` that is not loaded yet once."""
-        self._said = {LIBRARIES[name] for name in LIBRARIES if name in sys.modules}
+        self._announced = {LIBRARIES[name] for name in LIBRARIES if name in sys.modules}
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: object = None) -> None:
         """Find nothing; what only asks whether a library is installed, and does not import it, goes unsaid."""
         title = LIBRARIES.get(name)
-        if title is None or title in self._said or sys._getframe(2).f_code.co_name != "_find_and_load_unlocked":
+        if title is None or title in self._announced or sys._getframe(2).f_code.co_name != "_find_and_load_unlocked":
             return
-        self._said.add(title)
+        self._announced.add(title)
         with contextlib.suppress(OSError, ValueError, AttributeError):  # the error stream may be closed
             print(f"loading {title} ...", file=sys.stderr, flush=True)
 

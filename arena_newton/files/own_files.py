@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import BinaryIO
 
 from arena_newton.files.untrusted_files import create
 
-__all__ = ["MAX_LABEL", "PARTIAL", "file_label", "replace_atomically"]
+__all__ = ["MAX_LABEL", "PARTIAL", "file_label", "replace_atomically", "write_json"]
 
 PARTIAL = ".part"
 """Ending of a file that is being written; what a killed process leaves has it."""
@@ -55,3 +56,13 @@ def replace_atomically(path: str | Path, *, sync: bool = False) -> Iterator[Bina
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
+
+
+def write_json(path: Path, value: object, *, sort: bool = False) -> None:
+    """Write a value as indented JSON, with keys in order where `sort` says so.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with replace_atomically(path) as file:
+        file.write(json.dumps(value, indent=4, sort_keys=sort, ensure_ascii=False).encode())

@@ -302,6 +302,7 @@ class Camera:
             """Surfaces of the last render, before shading."""
             self.image = wp.zeros((self.views, height, width, 3), dtype=wp.uint8)
             """The pictures of the last render, uint8 [views, height, width, 3]."""
+        self._relit: wp.array | None = None
         # Two texels per pixel, and no more than a video needs.
         self._shadow_size = min(max(2 * max(w, h), 256), 1024)
         self._shadows: ShadowMaps | None = None
@@ -432,12 +433,20 @@ class Camera:
         Returns:
             float32 [views, height, width] on the model's device; with several rays per pixel that of one of them.
         """
-        depth: torch.Tensor = wp.to_torch(self.buffers.depth)[:, :: self.samples, :: self.samples]
-        if tuple(depth.shape[1:]) == (self.height, self.width):
-            return depth
-        whole = depth.new_zeros((self.views, self.height, self.width))
+        return self.whole(wp.to_torch(self.buffers.depth))
+
+    def whole(self, seen: torch.Tensor) -> torch.Tensor:
+        """Values of the part that the lens fills, [views, H, W] with `samples` per pixel, as whole pictures, 0 around.
+
+        Returns:
+            [views, height, width], of one of the samples of each pixel.
+        """
+        seen = seen[:, :: self.samples, :: self.samples]
+        if tuple(seen.shape[1:]) == (self.height, self.width):
+            return seen
+        whole = seen.new_zeros((self.views, self.height, self.width))
         top, left = self._origin
-        whole[:, top : top + self._size[0], left : left + self._size[1]] = depth
+        whole[:, top : top + self._size[0], left : left + self._size[1]] = seen
         return whole
 
     def distances(self, view: int, points: np.ndarray) -> np.ndarray:
@@ -470,13 +479,36 @@ class Camera:
 
     def _render(self, state: newton.State, body: wp.array | None) -> torch.Tensor:
         """Draw the views; `body` carries each one's camera, None leaves `poses` as they are."""
-        tracer, lights, buffers = self._tracer, self.lights, self.buffers
-        lights.upload()
         self.model.bvh_refit_shapes(state)
         if body is not None:
             launch_camera_poses(state.body_q, body, self._local, self.poses)
         self.draw()
-        maps = self._shadow_maps()
+        self._shade(self.lights, self.image)
+        return self._torch_image
+
+    def relit(self, lights: WorldLights, mask: np.ndarray) -> torch.Tensor:
+        """The last render of the worlds of a mask under other lights; pictures of the others stay as they were.
+
+        Args:
+            lights: A light per world.
+            mask: bool [worlds], worlds that the last `render` drew.
+
+        Returns:
+            uint8 [worlds, height, width, 3], on the model's device, overwritten by the next call.
+        """
+        if self._relit is None:
+            self._relit = wp.zeros_like(self.image)
+        asked = torch.as_tensor(mask, device=self._every.device)
+        self._torch_view_world.copy_(torch.where(asked, self._every, self._tracer.preserve))
+        self._shade(lights, self._relit)
+        picture: torch.Tensor = wp.to_torch(self._relit)
+        return picture
+
+    def _shade(self, lights: WorldLights, image: wp.array) -> None:
+        """Shade what was drawn into pictures."""
+        tracer, buffers = self._tracer, self.buffers
+        lights.upload()
+        maps = self._shadow_maps(lights)
         part = maps.frames.shape[0] or self.views
         for first in range(0, self.views, part):
             if lights.any_distant and not self.trace_shadows:
@@ -510,13 +542,12 @@ class Camera:
                 samples=self.samples,
                 size=self._size,
                 origin=self._origin,
-                image=self.image,
+                image=image,
             )
-        return self._torch_image
 
-    def _shadow_maps(self) -> ShadowMaps:
+    def _shadow_maps(self, lights: WorldLights) -> ShadowMaps:
         """The maps, without memory as long as no world has needed any."""
-        wanted = self.lights.any_distant and not self.trace_shadows
+        wanted = lights.any_distant and not self.trace_shadows
         if self._shadows is None or (wanted and not self._shadows.frames.shape[0]):
             size = self._shadow_size
             count = min(self.views, max(1, SHADOW_BYTES // (8 * size * size))) if wanted else 0

@@ -271,22 +271,22 @@ class EpisodeRecorder(Recorder):
             self._take(env, [world], final=True)
         elif self.strip and stream.last >= 0 and stream.ticks[-1] != stream.last:
             stream.keep(stream.last, self._now_poses[stream.rows].clone())
-        said = result.outcome if result.reason in (result.outcome, "", None) else f"{result.outcome} ({result.reason})"
+        text = result.outcome if result.reason in (result.outcome, "", None) else f"{result.outcome} ({result.reason})"
         for name, writer in stream.writers.items():
             if name in stream.last_frame:
                 held = caption(
                     stream.last_frame[name],
-                    f"{_time(stream.last)}  {said}",
+                    f"{_time(stream.last)}  {text}",
                     BRIGHT.get(result.outcome, (255, 255, 255)),
                 )
                 for _ in range(HOLD_FRAMES):
                     writer.write(held)
             writer.close()
         if self.strip and stream.poses:
-            self._write_strips(stream, world, result, said)
+            self._write_strips(stream, world, result, text)
         del self._streams[world]
 
-    def _write_strips(self, stream: _Stream, world: int, result: EpisodeResult, said: str) -> None:
+    def _write_strips(self, stream: _Stream, world: int, result: EpisodeResult, text: str) -> None:
         """Draw the frames of a strip, and nothing else, from the poses that were kept."""
         # Nearest to even spacing in time, first and last included.
         wanted = np.linspace(stream.ticks[0], stream.ticks[-1], STRIP_FRAMES)
@@ -304,7 +304,7 @@ class EpisodeRecorder(Recorder):
                 frames,
                 self.folder / "strips" / f"{stream.label}__{name}.jpg",
                 n=STRIP_FRAMES,
-                label=f"{stream.label.replace('__', ' ')}: {said}",
+                label=f"{stream.label.replace('__', ' ')}: {text}",
                 colour=COLOURS.get(result.outcome, (0, 0, 0)),
                 captions=[_time(stream.ticks[i]) for i in picks],
             )

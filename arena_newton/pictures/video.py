@@ -50,7 +50,7 @@ def _named(error: OSError, path: Path) -> OSError:
 
 
 class VideoWriter:
-    """An H.264 MP4 (yuv420p) that appears under its name only when it is complete.
+    """An H.264 MP4 (yuv420p, or RGB without loss) that appears under its name only when it is complete.
 
     Frames go to `<name>.part` next to the target; `close` renames it. Odd sizes are padded by one black row or column,
     because yuv420p halves both.
@@ -67,6 +67,7 @@ class VideoWriter:
         gop: int | None = None,
         b_frames: bool = True,
         sync: bool = False,
+        lossless: bool = False,
     ):
         """Open the file.
 
@@ -80,6 +81,7 @@ class VideoWriter:
                 frame decodes all from the key frame before it.
             b_frames: Allow frames that are predicted from later ones: smaller, slower to read in any order.
             sync: Wait at the end until the file is on the disk.
+            lossless: Keep every byte of the frames; `crf` is not used.
 
         Raises:
             OSError: The file cannot be written; the error carries its name.
@@ -95,13 +97,16 @@ class VideoWriter:
         self._container: av.container.OutputContainer | None
         self._container = av.open(str(self._part), mode="w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(float(fps)).limit_denominator(1000)
-        self._stream = self._container.add_stream("libx264", rate=rate)
+        stream = self._container.add_stream("libx264rgb" if lossless else "libx264", rate=rate)
+        assert isinstance(stream, av.VideoStream)
+        self._stream = stream
         self._stream.height, self._stream.width = self._size
-        self._stream.pix_fmt = "yuv420p"
+        self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
         # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
         # Without mbtree: it reads memory that nobody wrote, so that equal frames give different bytes now and then.
-        self._stream.options = {"crf": str(crf), "preset": "veryfast", "mbtree": "0"}
+        quality: dict[str, object] = {"qp": "0"} if lossless else {"crf": str(crf)}
+        self._stream.options = quality | {"preset": "veryfast", "mbtree": "0"}
         if gop is not None:
             self._stream.options |= {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
         if not b_frames:

@@ -347,9 +347,12 @@ class TaskSpec:
     semantic_variant: ByRules[str] = field(default_factory=lambda: ByRules.same("semantic"))
     semantic_change: Literal["texture", "shape", "clutter"] | None = None
     """Change that semantic mode of rule set `paper` makes: in textures and colours; in shapes that are drawn
-    without a collider; or by things that are added. The compiled model is else that of base mode. None: not said."""
+    without a collider; or by things that are added. The compiled model is else that of base mode. None: not given."""
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
+    recolour: Mapping[str, float] = field(default_factory=dict)
+    """Prim → probability with which changed looks may give it another colour (docs/datasets.md): 0 where the
+    instruction names its colour or nothing else tells it apart, little where a hand must find it; 1 of all others."""
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)
     """Mode → what it changes in this task in particular, in words, where the rule sets differ."""
 

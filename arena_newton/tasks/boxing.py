@@ -123,6 +123,7 @@ TASK = TaskSpec(
     judge=BoxingJudge,
     predicates=PREDICATES,
     semantic_change="shape",
+    recolour={TARGET: 0.0},
     expert="arena_newton.policies.experts.boxing:BoxingExpert",
     sample=sample_target,
 )

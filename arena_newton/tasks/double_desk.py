@@ -149,6 +149,7 @@ TASK = TaskSpec(
     judge=DoubleDeskJudge,
     predicates=PREDICATES,
     semantic_change="texture",
+    recolour={HAMMER: 0.15, BASKET: 0.15},
     expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",
     disturbance=0.5,
     light=ByRules(paper=None, released=DISTANT_LIGHT),

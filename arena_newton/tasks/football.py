@@ -142,6 +142,7 @@ TASK = TaskSpec(
     judge=FootballJudge,
     predicates=PREDICATES,
     semantic_change="texture",
+    recolour={BALL: 0.0},
     expert="arena_newton.policies.experts.football:FootballExpert",
     events={1: "ball_out"},
     semantic_variant=ByRules(paper="semantic", released="semantic_released"),

@@ -143,5 +143,6 @@ TASK = TaskSpec(
     judge=OpenDoorJudge,
     predicates=PREDICATES,
     semantic_change="texture",
+    recolour={HANDLE: 0.15},
     expert="arena_newton.policies.experts.open_door:OpenDoorExpert",
 )

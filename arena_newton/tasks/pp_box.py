@@ -191,6 +191,7 @@ TASK = TaskSpec(
     predicates=PREDICATES,
     light=ByRules(paper=None, released=DISTANT_LIGHT),
     semantic_change="clutter",
+    recolour={BOX: 0.15},
     expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
     disturbance=0.5,
 )

@@ -167,6 +167,7 @@ TASK = TaskSpec(
     judge=VisNaviJudge,
     predicates=PREDICATES,
     semantic_change="shape",
+    recolour={SIGN: 0.0},
     expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",
     mode_notes={
         "visual": ByRules(

@@ -87,15 +87,15 @@ def table(subject: str, results: Sequence[CheckResult]) -> str:
     return "\n".join([*lines, f"{subject}: {end}"])
 
 
-def json_object(said: object) -> str:
+def json_object(described: object) -> str:
     """A description as JSON text.
 
     Raises:
         Violation: It is not a JSON object.
     """
-    if not isinstance(said, dict):
-        raise Violation(f"describe() answers a {type(said).__name__}, expected a dict")
+    if not isinstance(described, dict):
+        raise Violation(f"describe() answers a {type(described).__name__}, expected a dict")
     try:
-        return json.dumps(said, sort_keys=True, allow_nan=False)
+        return json.dumps(described, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise Violation(f"describe() is not JSON: {error}") from None

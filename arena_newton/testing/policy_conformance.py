@@ -223,8 +223,8 @@ class _Trial:
             )
         _check_named(chunk, mask)
         if chunk.errors:
-            world, said = next(iter(chunk.errors.items()))
-            raise Violation(f"world {world} got no action: {said}")
+            world, text = next(iter(chunk.errors.items()))
+            raise Violation(f"world {world} got no action: {text}")
         if chunk.phases is not None and (
             len(chunk.phases) != worlds or not all(phase is None or isinstance(phase, str) for phase in chunk.phases)
         ):
@@ -373,12 +373,12 @@ class _Trial:
         if describe is None:
             raise Violation("has no describe(); policies.Policy has one that gives the name")
         self.run(self.seeds, [range(len(self.seeds))])
-        said = json_object(describe())
+        declared = json_object(describe())
         self.run(self.seeds)
-        if json_object(describe()) != said:
+        if json_object(describe()) != declared:
             raise Violation("describe() answers something else after an episode")
         if "name" not in describe():
-            raise Violation(f"describe() must hold a name: {said}")
+            raise Violation(f"describe() must hold a name: {declared}")
 
     def close(self) -> None:
         for _ in range(2):
@@ -391,11 +391,11 @@ def _check_named(chunk: Chunk, mask: np.ndarray) -> None:
     Raises:
         Violation: A world that did not ask, or no text.
     """
-    for world, said in chunk.errors.items():
+    for world, text in chunk.errors.items():
         if not isinstance(world, int | np.integer) or not 0 <= world < len(mask) or not mask[world]:
             raise Violation(f"errors name world {world!r}, which did not ask")
-        if not isinstance(said, str) or not said.strip():
-            raise Violation(f"errors say {said!r} about world {world}, expected a text")
+        if not isinstance(text, str) or not text.strip():
+            raise Violation(f"errors say {text!r} about world {world}, expected a text")
 
 
 def check_policy(

@@ -325,12 +325,12 @@ class _Trial:
 
     def describe(self) -> None:
         self.begin()
-        said = json_object(self.tracker.describe())
+        declared = json_object(self.tracker.describe())
         self.play(range(2))
-        if json_object(self.tracker.describe()) != said:
+        if json_object(self.tracker.describe()) != declared:
             raise Violation("describe() answers something else after two ticks")
-        if json.loads(said).get("name") != self.tracker.name:
-            raise Violation(f"describe() must hold the name {self.tracker.name!r}: {said}")
+        if json.loads(declared).get("name") != self.tracker.name:
+            raise Violation(f"describe() must hold the name {self.tracker.name!r}: {declared}")
 
 
 def check_tracker(

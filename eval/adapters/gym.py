@@ -47,7 +47,7 @@ NAMESPACE = "arena_newton"
 """Prefix of every id."""
 IMAGE_SIZE = (224, 224)
 """Width and height of observed pictures [px], as policies of the original see them."""
-SETTLE = ("steps", "reset")
+STARTUP = ("steps", "reset")
 """Calls in which an episode's start-up happens: steps whose action is ignored, or the reset."""
 REWARDS = ("success", "margin")
 """1 at success; or the change of the task's margin per tick, and 1 at success."""
@@ -99,7 +99,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         cameras: Mapping[str, str] | None = None,
         state_keys: Sequence[str] = ("agent_pos",),
         instruction: bool = True,
-        settle: str = "steps",
+        startup: str = "steps",
         reward: str = "success",
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         repeats: int = PROTOCOL_REPEATS,
@@ -127,7 +127,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
                 default `pixels` is the head camera's picture itself.
             state_keys: Names under which the state is observed.
             instruction: Observe the instruction too, as `task`.
-            settle: `steps`: an episode's start-up is ordinary steps whose action is ignored, and `info["settling"]`
+            startup: `steps`: an episode's start-up is ordinary steps whose action is ignored, and `info["startup"]`
                 names the worlds that are in it. `reset`: a reset leads its worlds through it while the others wait; a
                 robot that falls meanwhile is terminated by the next step.
             reward: `success`: 1 at success, else 0. `margin`: from the second tick on the change of the task's margin
@@ -144,7 +144,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         Raises:
             InputError: Something named in the message is unknown or does not fit.
         """
-        self.settle = _choice("settle", settle, SETTLE)
+        self.startup = _choice("startup", startup, STARTUP)
         self.reward = _choice("reward", reward, REWARDS)
         self.render_mode = None if render_mode is None else _choice("render_mode", render_mode, ("rgb_array",))
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
@@ -174,8 +174,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Instruction in natural language."""
         self.budget = self.env.budget if cap is None else min(cap, self.env.budget)
         """Step budget of an episode after its start-up [ticks]."""
-        startup = self.env.startup_ticks if self.settle == "steps" else 0
-        self._max_episode_steps = startup + self.budget  # the name by which LeRobot asks
+        ticks = self.env.startup_ticks if self.startup == "steps" else 0
+        self._max_episode_steps = ticks + self.budget  # the name by which LeRobot asks
         self._named, self._instruction = cameras is not None, instruction
         self._cameras: dict[str, Camera] = {}
         if size is not None:
@@ -192,7 +192,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._next: int | None = None
         """Number of the next episode that nobody plays yet; None before the first reset."""
         self._begun = np.zeros(n, dtype=bool)
-        self._over, self._told, self._terminated = (np.zeros(n, dtype=bool) for _ in range(3))
+        self._over, self._reported, self._terminated = (np.zeros(n, dtype=bool) for _ in range(3))
         """Worlds whose episode ended; whose end a step has returned; whose end is no truncation."""
         self._outcome, self._reason = (np.full(n, "", dtype=object) for _ in range(2))
         self._margin = np.full(n, np.nan)
@@ -291,21 +291,21 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self.env.reset(self._episode_seed[worlds].tolist(), worlds)
         self._begun |= mask
         self._unfilmed |= mask
-        for flags in (self._over, self._told, self._terminated):
+        for flags in (self._over, self._reported, self._terminated):
             flags[mask] = False
         self._outcome[mask] = self._reason[mask] = ""
         self._margin[mask] = np.nan
-        if self.settle == "reset":
+        if self.startup == "reset":
             self._lead_through(mask)
 
     def _lead_through(self, mask: np.ndarray) -> None:
         """Take the worlds of a mask through their start-up; the others wait."""
         stand = np.tile(STAND_ACTION, (self.num_envs, 1))
         while True:
-            settling = mask & ~self._over & (self.env.tick < 0)
-            if not settling.any():
+            startup = mask & ~self._over & (self.env.tick < 0)
+            if not startup.any():
                 return
-            self._end(self.env.step(stand, settling), settling)
+            self._end(self.env.step(stand, startup), startup)
 
     def _end(self, status: np.ndarray, stepped: np.ndarray) -> None:
         """End the episodes that a tick ended; their worlds stand still from now on."""
@@ -334,7 +334,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             InputError: Actions of another shape, or no reset before.
         """
         action = self._checked(actions)
-        restart = self._over & self._told if self.autoreset_mode == AutoresetMode.NEXT_STEP else self._over & False
+        restart = self._over & self._reported if self.autoreset_mode == AutoresetMode.NEXT_STEP else self._over & False
         stepping = ~self._over
         rewards = np.zeros(self.num_envs)
         if stepping.any():
@@ -347,7 +347,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._unfilmed |= seen
         ended = self._over & ~restart
         terminated, truncated = ended & self._terminated, ended & ~self._terminated
-        self._told |= ended
+        self._reported |= ended
         final: Info = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended.any():
             final = self._final(ended)
@@ -401,7 +401,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
     def _facts(self) -> dict[str, np.ndarray]:
         """Values of `info` for every world."""
         return {
-            "settling": (self.env.tick < 0) & ~self._over,
+            "startup": (self.env.tick < 0) & ~self._over,
             "seed": self._seed.copy(),
             "episode_seed": self._episode_seed.copy(),
             "steps": np.maximum(self.env.tick, 0),
@@ -418,9 +418,9 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         ended = mask & self._over
         if ended.any():
             for name, words in (("outcome", self._outcome), ("reason", self._reason)):
-                said = np.full(self.num_envs, None, dtype=object)
-                said[ended] = words[ended]
-                info[name], info[f"_{name}"] = said, ended.copy()
+                declared = np.full(self.num_envs, None, dtype=object)
+                declared[ended] = words[ended]
+                info[name], info[f"_{name}"] = declared, ended.copy()
         return info
 
     def _final(self, ended: np.ndarray) -> Info:

@@ -73,8 +73,8 @@ def start_figures() -> Iterator[BenchFigure]:
     ratio = f"; one module after the other {_judged(serial):.1f} s = {_judged(serial) / _judged(cold):.2f} x"
     for kind, bar, parts, more in (("compiled", COLD, cold, ratio), ("cached", WARM, warm, "")):
         seconds = _judged(parts)
-        said = ", ".join(f"{part} {value:.1f} s" for part, value in parts.items() if part != LIBRARIES)
-        note = f"{said}; before it, not in the figure: {LIBRARIES} {parts[LIBRARIES]:.1f} s"
+        text = ", ".join(f"{part} {value:.1f} s" for part, value in parts.items() if part != LIBRARIES)
+        note = f"{text}; before it, not in the figure: {LIBRARIES} {parts[LIBRARIES]:.1f} s"
         note += f", from the start of the process {sum(parts.values()):.1f} s{more}"
         if not cuda:
             note = f"{seconds:.1f} s, judged on CUDA only: {note}"

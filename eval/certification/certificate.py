@@ -14,8 +14,8 @@ from typing import TypedDict
 from arena_newton.eval.certification.claims import CLAIMS, ClaimFinding, claimed, verdict_of
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
 from arena_newton.eval.records.journal import write_atomic
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports.html_report import FOLDER
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 from arena_newton.pages.html import EMBEDDED, render
 from arena_newton.pages.tables import Table, escaped
@@ -107,9 +107,9 @@ def _sheet(sheet: Table) -> JsonObject:
     return {"title": sheet.title, "head": list(sheet.head), "rows": [list(map(str, row)) for row in sheet.rows]}
 
 
-def _said(facts: Facts) -> list[tuple[str, str]]:
+def _described(facts: Facts) -> list[tuple[str, str]]:
     """The facts as name and text."""
-    said = [
+    lines = [
         ("made by", facts["command"]),
         ("tasks", " ".join(facts["tasks"])),
         ("policies", "the tasks' experts, privileged: they read the world itself"),
@@ -119,8 +119,8 @@ def _said(facts: Facts) -> list[tuple[str, str]]:
         ("arena-newton", f"{facts['versions'].get('arena-newton')}, code {facts['code']}"),
     ]
     if facts["without_expert"]:
-        said.insert(2, ("without an expert, not checked", " ".join(facts["without_expert"])))
-    return said
+        lines.insert(2, ("without an expert, not checked", " ".join(facts["without_expert"])))
+    return lines
 
 
 def _warnings(facts: Facts) -> list[str]:
@@ -158,12 +158,12 @@ def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     claims, rows = claimed(findings), []
     for one in claims:
         verdicts = {check.name: finding.verdict for check, finding in one.findings}
-        told = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
-        rows.append((escaped(one.text), one.verdict, "<br>".join(told)))
+        measured = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
+        rows.append((escaped(one.text), one.verdict, "<br>".join(measured)))
     lines += Table(("claim", "verdict", "measured"), rows).compact()
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
-    lines += [f"- {name}: {escaped(text)}" for name, text in _said(facts)]
+    lines += [f"- {name}: {escaped(text)}" for name, text in _described(facts)]
     for check, finding in (part for one in claims for part in one.findings):
         lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary), ""]
         for sheet in finding.sheets:
@@ -181,7 +181,7 @@ def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
         sources=EMBEDDED,
         verdict=verdict_of(findings, len(facts["planned"])),
         claims=[{"text": one.text, "verdict": one.verdict, "measured": _measured(one)} for one in claims],
-        facts=_said(facts),
+        facts=_described(facts),
         warnings=_warnings(facts),
         meaning=MEANING,
         versions=facts["versions"].items(),

@@ -130,8 +130,8 @@ def _found(context: Context, chosen: Sequence[Check], facts: certificate.Facts) 
         try:
             finding = findings[check] = check.run(context)
         except ContradictionError as error:
-            said = plain_text(str(error).replace(f"{context.folder}/", ""), 300)
-            finding = findings[check] = CheckFinding("fail", said)
+            declared = plain_text(str(error).replace(f"{context.folder}/", ""), 300)
+            finding = findings[check] = CheckFinding("fail", declared)
         spent = duration(time.perf_counter() - started)
         print(f"{finding.verdict:<4}  {check.name:<12}  {finding.summary}  ({spent})", flush=True)
         if options.jobs:

@@ -43,8 +43,8 @@ class ClaimFinding:
     @property
     def text(self) -> str:
         """The claim, with what its checks found that belongs into its line."""
-        said = "; ".join(finding.claim for _, finding in self.findings if finding.claim)
-        return f"{self.claim.text.removesuffix('.')}: {said}." if said else self.claim.text
+        message = "; ".join(finding.claim for _, finding in self.findings if finding.claim)
+        return f"{self.claim.text.removesuffix('.')}: {message}." if message else self.claim.text
 
     @property
     def verdict(self) -> Verdict:
@@ -106,7 +106,7 @@ def verdict_of(findings: Mapping[Check, CheckFinding], planned: int) -> str:
         planned: How many checks are to be run.
     """
     counts = Counter(one.verdict for one in claimed(findings))
-    told = [
+    lines = [
         f"{counted(counts[verdict], 'claim')} {words[counts[verdict] != 1]}"
         for verdict, words in WORDS.items()
         if counts[verdict]
@@ -119,4 +119,4 @@ def verdict_of(findings: Mapping[Check, CheckFinding], planned: int) -> str:
         begin = f"Not finished, {left} of {planned} checks have not run"
     else:
         begin = "Certified" if counts["pass"] or counts["note"] else "Nothing was certified"
-    return f"{begin}: {', '.join(told) or 'nothing was measured'}."
+    return f"{begin}: {', '.join(lines) or 'nothing was measured'}."

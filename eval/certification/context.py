@@ -23,7 +23,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
 from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import Json
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import counted
 from arena_newton.rules import seeding
 
@@ -145,12 +145,12 @@ class Context:
         )
         return self.play(options, cell.folder.replace("/", " "), self.bodies[cell.body])
 
-    def play(self, options: RunOptions, said: str, body: Body | None = None) -> list[EpisodeRecord]:
+    def play(self, options: RunOptions, title: str, body: Body | None = None) -> list[EpisodeRecord]:
         """Episodes of a run in plan order; played, or continued where its results folder has some of them.
 
         Args:
             options: The run; `out` names its folder.
-            said: What it is called in a line about what is going on.
+            title: Its name in lines about progress.
             body: Changes the robot; none by default.
 
         Raises:
@@ -166,7 +166,7 @@ class Context:
                 lines = f"{len(records)} of {counted(len(config.episodes), 'planned episode')} are in the journal"
                 raise ContradictionError(f"{folder.path}: {lines} of a run that ended; it was changed by hand")
             return records
-        self.say(f"{said}: {counted(len(config.episodes), 'episode')}")
+        self.say(f"{title}: {counted(len(config.episodes), 'episode')}")
         with contextlib.redirect_stdout(io.StringIO()):  # its table is part of a larger one here
             code = run.execute(folder, self.factories if body is None else body.equip(self.factories))
         if code == 130:

@@ -70,7 +70,7 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
     }
     for name, text in files.items():
         write_atomic(out / name, text, "what was compared is as it was")
-    for line in _said(comparison):
+    for line in _summary(comparison):
         print(plain(line))
     for note in remarks(comparison, contenders):
         print(note)
@@ -78,7 +78,7 @@ def run(folders: Sequence[Path], options: CompareOptions) -> int:
     return 0
 
 
-def _said(comparison: Comparison) -> list[str]:
+def _summary(comparison: Comparison) -> list[str]:
     """Rates with letters, best first, and a sentence per pair."""
     from arena_newton.eval.tables.comparison_text import p_text, rate_text, verdict
 

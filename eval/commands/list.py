@@ -35,8 +35,8 @@ def run(options: ListOptions) -> int:
         return 0
     print(f"{counted(len(episodes), 'episode')}, {simulated(sum(episode.max_steps for episode in episodes))}")
     cells = Counter((episode.task, episode.tracker, episode.mode) for episode in episodes)
-    if told := detectable_text(list(cells.values())):
-        print(told)
+    if text := detectable_text(list(cells.values())):
+        print(text)
     for episode in episodes:
         print(
             f"{episode.index:>5} {episode.task:<12} {episode.tracker:<8} {episode.mode:<10} seed {episode.group_seed} "

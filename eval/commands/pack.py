@@ -165,9 +165,9 @@ def _check_usual(run: RunRecord) -> None:
         # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
         played = f"{len(run.records):,} of {counted(run.document['planned'], 'episode')}"
         raise InputError(f"{where}: is unfinished ({played}), and what ends first is no fair sample; eval resume it")
-    for name, said in (("max_steps", "--max-steps"), ("variant", "--variant")):
+    for name, text in (("max_steps", "--max-steps"), ("variant", "--variant")):
         if run.config.get(name) is not None:
-            raise InputError(f"{where}: was played with {said}, which makes it no result of the benchmark")
+            raise InputError(f"{where}: was played with {text}, which makes it no result of the benchmark")
 
 
 def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:

@@ -38,7 +38,6 @@ def run(folders: Sequence[Path], options: ReportOptions, factories: Factories | 
     """
     from arena_newton.eval.folders.results import load_run
     from arena_newton.eval.reports import report
-    from arena_newton.eval.reports.learned_row import row_results
     from arena_newton.eval.tables import run_table
 
     if options.table or len(folders) > 1:
@@ -59,7 +58,7 @@ def run(folders: Sequence[Path], options: ReportOptions, factories: Factories | 
     if options.json:
         print(json.dumps(results, indent=2))
         return 0
-    print(report.table(results, row_results(record)))
+    print(report.table(results))
     for note in report.notes(record, results):
         print(note)
     print(f"report: {folder / 'report.html'}")

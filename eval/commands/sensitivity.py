@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,13 +14,11 @@ from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.files.text import counted
-from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
     from arena_newton.eval.play.run import Factories
     from arena_newton.eval.studies.placement_axes import Axis
     from arena_newton.eval.studies.placement_files import PointTally
-    from arena_newton.interfaces import EpisodeResult
 
 __all__ = ["SensitivityOptions", "run"]
 
@@ -56,9 +53,8 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
         StorageError: A file cannot be written.
     """
     from arena_newton.eval.records.journal import write_atomic
-    from arena_newton.eval.reports.progress import Progress
     from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
-    from arena_newton.eval.studies.placement_files import PlacedRows, point_rows, study_folder, tallies
+    from arena_newton.eval.studies.placement_files import PlacedStudy, point_rows, study_folder, summary_json, tallies
     from arena_newton.eval.studies.placement_map import draw_grid
     from arena_newton.eval.tables.suite_figures import save
 
@@ -73,23 +69,17 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
         raise InputError(f"--grid and --repeats: make {count:,} episodes, at most {MOST_EPISODES:,}")
     with PlacedWorlds(config, axes, factories) as worlds:
         folder = study_folder(options.out, "sensitivity", config.flags.task[0], options.tracker, options.mode)
-        rows = PlacedRows(folder, axes)
-        budget = config.episodes[0].max_steps
-        progress = Progress(budget * count, planned=count)
-        progress.group(f"{config.flags.task[0]} {options.tracker} {options.mode}")
-
-        def ended(result: EpisodeResult) -> None:
-            rows.add(result)
-            progress.episode(budget, round(result.sim_s / TICK))
-
-        try:
-            results = worlds.play(worlds.placed(points), ended, progress.tick)
-        finally:
-            progress.close()
-            rows.close()
-    found = tallies(results)
+        with PlacedStudy(worlds, folder, count) as study:
+            study.play(points)
+    found = tallies(study.results)
     write_atomic(folder / "sensitivity.csv", point_rows(axes, found))
-    write_atomic(folder / "sensitivity.json", _json(options, axes, grid, found))
+    successes, judged = sum(one.successes for one in found), sum(one.judged for one in found)
+    described = [
+        dataclasses.asdict(axis) | {"name": axis.name, "grid": values} for axis, values in zip(axes, grid, strict=True)
+    ]
+    told = {"interval": wilson(successes, judged), "points": [one.to_json() for one in found]}
+    document = summary_json(FORMAT, options, described, successes=successes, judged=judged, **told)
+    write_atomic(folder / "sensitivity.json", document)
     title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
     save(draw_grid(axes, grid, found, title), folder / "sensitivity.png")
     print("\n".join(summary(axes, found)))
@@ -120,44 +110,19 @@ def _grid(axes: Sequence[Axis], points: Sequence[int], most: int) -> list[tuple[
 
 def summary(axes: Sequence[Axis], points: Sequence[PointTally]) -> list[str]:
     """Rate over all placements and the worst of them, in words."""
+    from arena_newton.eval.studies.placement_files import rate_text
+
     successes, judged = sum(one.successes for one in points), sum(one.judged for one in points)
     errors = sum(one.errors for one in points)
-    low, high = wilson(successes, judged)
-    rate = f"{successes / judged:.1%}" if judged else "none judged"
-    lines = [
-        f"success over {counted(len(points), 'placement')}: {successes}/{judged} ({rate}, 95 % {low:.1%} to {high:.1%})"
-    ]
+    lines = [f"success over {counted(len(points), 'placement')}: {rate_text(successes, judged)}"]
     if errors:
         lines.append(f"{counted(errors, 'episode')} ended with an error and are in no rate")
-    told = [one for one in points if one.judged]
+    rated = [one for one in points if one.judged]
     if successes < judged:
-        worst = min(told, key=lambda one: (one.rate, one.mean_margin))
+        worst = min(rated, key=lambda one: (one.rate, one.mean_margin))
         counts = f"{worst.successes}/{worst.judged}, mean margin {worst.mean_margin:+.3f} m"
         lines.append(f"worst at {worst.where(axes)}: {counts}")
-    elif told:
-        slowest = max(told, key=lambda one: one.success_s)
+    elif rated:
+        slowest = max(rated, key=lambda one: one.success_s)
         lines.append(f"slowest at {slowest.where(axes)}: {slowest.success_s:.1f} s")
     return lines
-
-
-def _json(
-    options: SensitivityOptions, axes: Sequence[Axis], grid: Sequence[Sequence[float]], points: Sequence[PointTally]
-) -> str:
-    successes, judged = sum(one.successes for one in points), sum(one.judged for one in points)
-    told = [
-        {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
-        for row in (dataclasses.asdict(one) | {"success_rate": one.rate} for one in points)
-    ]
-    document = {
-        "format": FORMAT,
-        "flags": {name: value for name, value in dataclasses.asdict(options).items() if name not in ("out", "worlds")},
-        "axes": [
-            dataclasses.asdict(axis) | {"name": axis.name, "grid": values}
-            for axis, values in zip(axes, grid, strict=True)
-        ],
-        "successes": successes,
-        "judged": judged,
-        "interval": wilson(successes, judged),
-        "points": told,
-    }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"

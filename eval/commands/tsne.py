@@ -13,9 +13,9 @@ from arena_newton.errors import InputError
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
     from arena_newton.eval.studies.action_map import ActionMap, Separation
     from arena_newton.eval.studies.predicted_actions import DatasetObservations
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.policies.base import Policy
 
 __all__ = ["TsneOptions", "run"]
@@ -158,13 +158,13 @@ def _separation(found: Separation) -> JsonObject:
 
 
 def _line(task: str, one: ActionMap, result: JsonObject) -> str:
-    told = [
+    accuracies = [
         f"from the {what} {100 * r.accuracy:.1f} % ({100 * r.low:.0f} to {100 * r.high:.0f})"
         for what, r in (("action", one.actions), ("state", one.observations))
     ]
     number = result["samples_per_source"]
     sources = f"{number} + {number} observations of {one.names[0]} and {one.names[1]}"
-    return f"{task}: {sources}; source told {', '.join(told)}; chance 50 %"
+    return f"{task}: {sources}; source told {', '.join(accuracies)}; chance 50 %"
 
 
 def _title(spec: str) -> str:

@@ -8,47 +8,14 @@ did, then contact and what came after it, then posture, approach, and last wheth
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.plan.interaction import INTERACTIONS, Interaction
 from arena_newton.eval.records.episode_signals import EpisodeSignals
+from arena_newton.eval.records.journal import EpisodeRecord
 
-__all__ = ["BARS", "BAND", "Bars", "Judged", "near_bars", "sees_at_start", "stage_of", "waits_in_view"]
-
-
-class Judged(Protocol):
-    """Fields of an episode's line that the rules read (`journal.EpisodeRecord`)."""
-
-    @property
-    def task(self) -> str:
-        """Name of its task."""
-
-    @property
-    def outcome(self) -> str:
-        """`success`, `fall`, `timeout` or `error`."""
-
-    @property
-    def reason(self) -> str | None:
-        """Finer cause of the outcome, such as `ball_out`."""
-
-    @property
-    def steps(self) -> int:
-        """Its length [ticks]."""
-
-    @property
-    def startup_fall(self) -> bool:
-        """It fell before the policy acted."""
-
-    @property
-    def predicates(self) -> Mapping[str, int | None]:
-        """Predicate of its task → first tick at which it held; None where it never did."""
-
-    @property
-    def signals(self) -> EpisodeSignals | None:
-        """None where they were not kept."""
+__all__ = ["BARS", "BAND", "Bars", "near_bars", "sees_at_start", "stage_of", "waits_in_view"]
 
 
 @dataclass(frozen=True)
@@ -99,7 +66,7 @@ WAITS = 0.5
 show it. Those that were seen to wait stayed 0.6 to 0.9 of it."""
 
 
-def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
+def stage_of(episode: EpisodeRecord, bars: Bars = BARS) -> FailureStage | None:
     """Stage at which an episode failed; None for a success, an error, and an episode without signals."""
     signals = episode.signals
     if signals is None or episode.outcome not in ("fall", "timeout"):
@@ -127,13 +94,13 @@ def stage_of(episode: Judged, bars: Bars = BARS) -> FailureStage | None:
     return FailureStage.APPROACH if engaged else FailureStage.PERCEPTION
 
 
-def _touched(episode: Judged, signals: EpisodeSignals, task: Interaction) -> int | None:
+def _touched(episode: EpisodeRecord, signals: EpisodeSignals, task: Interaction) -> int | None:
     """Tick of the first touch; None where there was none, or the task's own predicate says that there was none."""
-    said = episode.predicates.get(task.predicate, signals.first_touch)
-    return None if said is None or signals.first_touch is None else max(said, signals.first_touch)
+    declared = episode.predicates.get(task.predicate, signals.first_touch)
+    return None if declared is None or signals.first_touch is None else max(declared, signals.first_touch)
 
 
-def _without_effect(episode: Judged, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
+def _without_effect(episode: EpisodeRecord, signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
     """A loose object stayed where it was when it was touched, and no later predicate of its task held.
 
     Of a carried object that is still touched at the end how far it was pushed is not known: `moved` is 0.
@@ -153,7 +120,7 @@ def _in_pose(signals: EpisodeSignals, task: Interaction, bars: Bars) -> bool:
     return distance <= bars.stop_distance * task.stance and bearing <= bars.stop_bearing * task.bearing
 
 
-def near_bars(episode: Judged) -> tuple[str, ...]:
+def near_bars(episode: EpisodeRecord) -> tuple[str, ...]:
     """Signals within a tenth of a bar beyond which the stage would be another."""
     stage, signals = stage_of(episode), episode.signals
     if stage is None or signals is None:
@@ -169,7 +136,7 @@ def near_bars(episode: Judged) -> tuple[str, ...]:
     return tuple(found)
 
 
-def waits_in_view(episode: Judged) -> bool:
+def waits_in_view(episode: EpisodeRecord) -> bool:
     """A robot that failed stayed slow near the object, which it had in view, for most of its episode."""
     signals = episode.signals
     if signals is None or episode.outcome != "timeout":

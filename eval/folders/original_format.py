@@ -14,9 +14,9 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.records.journal import EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import population_std, seed_rates
 from arena_newton.files.own_files import file_label
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table
 
 __all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]

@@ -20,9 +20,9 @@ from arena_newton.eval.records import document as documents
 from arena_newton.eval.records.document import CONFIG_FILE, Document, read_document
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
-from arena_newton.eval.records.schema import JsonObject, check_types
 from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import plain_text
 
 __all__ = [
@@ -43,7 +43,7 @@ EPISODES = "episodes"
 """Folder of the files of recorded episodes."""
 SUBFOLDERS = ("videos", "strips", "actions", "failures", "original", EPISODES, f"{EPISODES}/{VIDEO_FOLDER}")
 """Folders that a run writes inside its own."""
-RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth")
+RECORDING_FLAGS = ("record", "record_cameras", "record_size", "record_depth", "record_looks")
 """Flags that all episodes of a folder share, though they change none of them."""
 BREAK_FILE = "break.txt"
 """File with the trace of a break, for a later look."""
@@ -63,9 +63,13 @@ def results_folder(out: str | None, shard: Shard | None = None) -> Path:
     return Path(out).expanduser()
 
 
+FORMER_FLAGS = ("seeing",)
+"""Flags of earlier versions that change nothing any more."""
+
+
 def stored_options(folder: Path) -> RunOptions:
     """The flags that a results folder was made with, to be resumed."""
-    stored = read_document(folder)["options"]
+    stored = {name: value for name, value in read_document(folder)["options"].items() if name not in FORMER_FLAGS}
     where = f"{folder / CONFIG_FILE}: options"
     return dataclasses.replace(RunOptions(**check_types(where, stored, RunOptions)), out=str(folder))
 
@@ -91,7 +95,7 @@ class ResultsFolder:
         """Name the folder, the run and the versions of the libraries; nothing is read or written."""
         self.path, self.config, self.installed = path, config, dict(installed)
         self.document: Document
-        """Content of config.json, once the folder is settled."""
+        """Content of config.json, once the folder is prepared."""
 
     @property
     def journal(self) -> Path:
@@ -163,7 +167,7 @@ class ResultsFolder:
         except OSError as error:
             raise InputError(f"--out {self.path}: cannot be created ({error.strerror})") from None
 
-    def settle(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
+    def prepare(self, config: RunConfig, played: Sequence[EpisodeRecord]) -> None:
         """Write config.json into a new folder, or hold the run to the one that is there; the journal's lock is held.
 
         `config` now has what tracker and policy say of themselves; `played` are the lines of the journal.

@@ -29,9 +29,10 @@ from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.run import Factories, execute
 from arena_newton.eval.records.document import read_document
 from arena_newton.eval.records.journal import write_atomic
-from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, parse, read_regular
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.new_folder import held_folder
 from arena_newton.files.own_files import PARTIAL, file_label
+from arena_newton.files.stored_json import parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.physics.devices import resolve_engine
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
@@ -64,7 +65,7 @@ def run(options: LoopOptions, factories: Factories | None = None) -> int:
         was recorded, 130 interrupted.
 
     Raises:
-        InputError: A flag or the folder is wrong, or something is missing that a later stage needs; said before
+        InputError: A flag or the folder is wrong, or something is missing that a later stage needs, before
             anything is played.
     """
     options = resolved(options)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
 from arena_newton.cli.flags import check_least, shared
+from arena_newton.data.readers.looks import MOST_LIGHTS
 from arena_newton.data.recording.episode import CAMERAS
 from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
@@ -44,8 +45,8 @@ from arena_newton.eval.records.identity import (
     own_code,
     scenes_hash,
 )
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.physics.devices import cluster_engine, resolve_engine
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig, Fit, robot_fit, video_sizes
@@ -262,6 +263,7 @@ def recording_run(options: RecordOptions) -> RunOptions:
         record_cameras=options.cameras,
         record_size=options.size,
         record_depth=options.depth,
+        record_looks=options.looks,
         series=options.seed_series,
         keep=options.episodes if options.only_success else None,
     )
@@ -322,7 +324,6 @@ def resolve(options: RunOptions) -> RunConfig:
         repeats=repeats,
         max=(options.max or MOST_EPISODES) if options.until_width is not None else None,
         strip=options.strip or quick,
-        seeing=options.seeing or (quick and options.policy == "expert" and not options.record),
         follow=options.follow or quick,
         checkpoint=str(checkpoint) if checkpoint else None,
         variant=str(variant) if variant else None,
@@ -427,6 +428,14 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
         )
     if options.record_depth and not options.record_cameras:
         raise InputError(f"{flag}depth: belongs to cameras, none is recorded")
+    if not 0 <= options.record_looks <= MOST_LIGHTS:
+        raise InputError(f"{flag}looks {options.record_looks}: expected 0 to {MOST_LIGHTS}")
+    if options.record_looks and "front" not in options.record_cameras:
+        raise InputError(f"{flag}looks: are those of the camera front, which is not recorded")
+    if options.record_looks and (shown := {"semantic", "visual"} & {*options.mode}):
+        raise InputError(
+            f"{flag}looks: belongs to modes base and execution, not {min(shown)}: none must learn its looks"
+        )
     found = {}
     for name in options.record_cameras:
         if name not in CAMERAS:

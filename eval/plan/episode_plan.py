@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED, JsonObject
+from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import MODES
 
@@ -150,5 +151,5 @@ def listed(episode: Episode) -> JsonObject:
         light = dataclasses.asdict(draws.light)
         light |= {"direction": list(draws.light.direction), "color": list(draws.light.color)}
     keys = ("task", "mode", "rules", "group_seed", "repeat", "episode_seed", "object_seed")
-    said = {key: getattr(episode, key) for key in keys}
-    return said | {"sampled": draws.sampled, "placed": placed, "light": light, "max_steps": episode.max_steps}
+    facts = {key: getattr(episode, key) for key in keys}
+    return facts | {"sampled": draws.sampled, "placed": placed, "light": light, "max_steps": episode.max_steps}

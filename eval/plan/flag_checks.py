@@ -85,7 +85,7 @@ def _check_shard(options: RunOptions) -> None:
     if options.shard is None:
         return
     parse_shard(options.shard)
-    if is_quick(options) or options.seeing:
+    if is_quick(options):
         raise InputError(
             "--shard: splits a plan, which --task, --seeds or --repeats name; --task all is the benchmark's"
         )
@@ -94,7 +94,7 @@ def _check_shard(options: RunOptions) -> None:
 
 
 def _check_chunks(options: RunOptions) -> None:
-    """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first look."""
+    """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first query."""
     replan, late = options.replan, options.latency_ticks
     check_least(options, 1, "replan")
     check_least(options, 0, "latency_ticks")
@@ -102,7 +102,7 @@ def _check_chunks(options: RunOptions) -> None:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")
     if options.ensemble and replan is None and late:
         raise InputError(
-            f"--latency-ticks {late}: --ensemble looks every tick; name more than {late} ticks by --replan"
+            f"--latency-ticks {late}: --ensemble queries every tick; name more than {late} ticks by --replan"
         )
 
 

@@ -72,12 +72,12 @@ class Chunks:
     """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
     itself when none is named, and v3.1 where it says nothing."""
     replan: int | None = None
-    """For --policy lerobot: execute only the first so many actions of each chunk, then look again."""
+    """For --policy lerobot: execute only the first so many actions of each chunk, then query it again."""
     ensemble: bool = False
-    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; looks every 2 ticks, or as
+    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; queried every 2 ticks, or as
     --replan says."""
     latency_ticks: int = 0
-    """Ticks of 0.02 s from a policy's look to the first action of its chunk; the chunk before goes on meanwhile."""
+    """Ticks of 0.02 s from a policy's query to the first action of its chunk; the chunk before goes on meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,8 @@ class Recording:
     """Size of their pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
+    record_looks: int = 0
+    """Write what every fifth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Ray:
     ray_gpus: float | None = None
     """With --ray: GPUs of each of them, such as 0.5 for two on one GPU; 1 when not given, none on engine mujoco."""
     ray_minutes: float = 60.0
-    """With --ray: a slice of a run, at most two batches of worlds, that takes longer is stopped and played again."""
+    """With --ray: a batch of episodes, at most twice --worlds, that takes longer is stopped and played again."""
     ray_attempts: int = 3
     """With --ray: an episode whose process died so often while it played nothing else ends as an error."""
 
@@ -266,8 +268,6 @@ class RunOptions(
     Without it such a break stops the run and leaves them unplayed."""
     retry_errors: bool = False
     """On resume, run episodes again that ended with an error."""
-    seeing: Annotated[bool, tyro.conf.Suppress] = False
-    """Also play a few episodes of the policy that comes with the package (the default run)."""
     series: Annotated[int | None, tyro.conf.Suppress] = None
     """Series of demonstrations whose seeds are played instead of the evaluation's (`eval record`)."""
     keep: Annotated[int | None, tyro.conf.Suppress] = None
@@ -304,6 +304,9 @@ class _Demonstrations:
     """Size of the pictures: 640x480 is the sensor's own shape, a square has black bars as policies see it [px]."""
     depth: bool = False
     """Write the depth of each picture too, float16 [m]."""
+    looks: int = 0
+    """Write what every fifth picture shows and its light under so many second lights, 1 or 2, so that a training can
+    change its looks (docs/recording.md)."""
 
 
 @dataclass(frozen=True)

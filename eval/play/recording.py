@@ -25,7 +25,7 @@ from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.records.identity import moving_versions, scenes_hash
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "encoding_threads",
     "facts_of",
     "is_recorded",
+    "lights_of",
     "outcome_lines",
 ]
 
@@ -84,6 +85,7 @@ def demonstration_recorder(config: RunConfig, folder: Path, facts: JsonObject) -
         folder / EPISODES,
         cameras=config.recording,
         depth=config.flags.record_depth,
+        looks=config.flags.record_looks,
         only_success=config.flags.keep is not None,
         facts=facts,
         threads=encoding_threads(),
@@ -122,9 +124,20 @@ def is_recorded(config: RunConfig, folder: Path, record: EpisodeRecord, episode:
             return False
         file = EpisodeFile(path)
         same = file.integer("arena_episode_seed") == episode.episode_seed and file.rows == record.steps
+        same &= config.flags.record_looks == lights_of(file)
         return same and set(file.cameras) == set(config.recording) and _whole(file, file.cameras)
     except InputError:
         return False
+
+
+def lights_of(file: EpisodeFile) -> int:
+    """Second lights of a recorded episode's looks; 0 without looks.
+
+    Raises:
+        InputError: The looks are damaged, or their film is absent.
+    """
+    found = file.looks("front") if "front" in file.cameras else None
+    return 0 if found is None else len(found[0].lights)
 
 
 def _whole(file: EpisodeFile, cameras: Iterable[str]) -> bool:

@@ -129,7 +129,7 @@ def _folders(options: RecordOptions) -> tuple[Path, Path]:
     if not options.cameras:
         raise InputError("--cameras: names none; record --from is for pictures")
     pictures = RunOptions(record_cameras=options.cameras, record_size=options.size, record_depth=options.depth)
-    recorded_cameras(pictures, "--")
+    recorded_cameras(dataclasses.replace(pictures, record_looks=options.looks), "--")
     out = Path(options.out).expanduser()
     if out.resolve() == source.resolve() or source.resolve().is_relative_to(out.resolve()):
         raise InputError(f"--out {out}: is the source, which stays as it is; choose another folder")
@@ -155,6 +155,8 @@ def _done(out: Path, source: EpisodeFile, config: RunConfig) -> bool:
                 return False
             if config.flags.record_depth and vision(camera, "depth") not in file:
                 return False
+        if config.flags.record_looks and config.flags.record_looks != recording.lights_of(file):
+            return False
         return file.integer("arena_episode_seed") == source.integer("arena_episode_seed")
     except InputError:
         return False
@@ -191,6 +193,7 @@ def _checked(options: RecordOptions, key: tuple[str, ...], group: Sequence[Episo
         record_cameras=options.cameras,
         record_size=options.size,
         record_depth=options.depth,
+        record_looks=options.looks,
         verbose=options.verbose,
     )
     config = resolve(flags)
@@ -262,6 +265,7 @@ class _Replay:
                 self.out / EPISODES,
                 cameras=config.recording,
                 depth=flags.record_depth,
+                looks=flags.record_looks,
                 threads=recording.encoding_threads(),
                 processes=recording.encoding_processes(),
                 finishing=self._finished,
@@ -336,7 +340,9 @@ class _Replay:
         }
         for name in source.cameras:
             if name not in cameras:
-                _copy(source.video(name), self.out / EPISODES / VIDEO_FOLDER / source.video(name).name)
+                looks = source.looks(name)
+                for film in (source.video(name), *([looks[1]] if looks else [])):
+                    _copy(film, self.out / EPISODES / VIDEO_FOLDER / film.name)
         dropped = [name for name in source.names if name in remade and name not in changes]
         return source.copy_of({name: np.asanyarray(array) for name, array in changes.items()}, dropped)
 

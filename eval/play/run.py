@@ -18,6 +18,7 @@ import torch
 import warp as wp
 
 from arena_newton import policies, trackers
+from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
@@ -39,7 +40,7 @@ from arena_newton.eval.play.run_flow import (
     groups,
     kept,
     progress_of,
-    run_and_report,
+    reported,
     told_how_to_go_on,
 )
 from arena_newton.eval.play.signal_recorder import SignalRecorder
@@ -83,8 +84,8 @@ class Factories:
     """Raises InputError for a file that is not a scene of the task."""
 
 
-def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
-    """Run or continue the run of a folder that was checked, and that of a folder inside, whose rows join its table.
+def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
+    """Run or continue the run of a folder that was checked.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -95,8 +96,10 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         RunStopped: Simulator, tracker or policy broke down as a whole; finished episodes are kept.
     """
     quiet_warp()
-    made_of = factories or Factories()
-    return run_and_report(folder, beside, lambda one: _played(one, made_of))
+    began = time.perf_counter()
+    if not _played(folder, factories or Factories()):
+        return INTERRUPTED
+    return reported(folder, time.perf_counter() - began)
 
 
 def _played(folder: ResultsFolder, factories: Factories) -> bool:
@@ -178,7 +181,7 @@ def _play(
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
     folder.make()
     with Journal(folder.journal) as journal:
-        folder.settle(config, journal.records)
+        folder.prepare(config, journal.records)
         folder.sweep()
         run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.cli.flags import shell_command
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.results import Results, RunRecord, load_run
@@ -39,7 +37,6 @@ __all__ = [
     "kept",
     "progress_of",
     "reported",
-    "run_and_report",
     "told_how_to_go_on",
 ]
 
@@ -53,38 +50,17 @@ class RunStopped(ArenaError):
     exit_code = 2
 
 
-def run_and_report(folder: ResultsFolder, beside: ResultsFolder | None, played: Callable[[ResultsFolder], bool]) -> int:
-    """Run or continue the run of a folder that was checked, and that of a folder inside, whose rows join its table.
-
-    Args:
-        folder: Of the run.
-        beside: Of the run inside.
-        played: Plays what is missing in a folder; False when it was interrupted.
-
-    Returns:
-        Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
-    """
-    began = time.perf_counter()
-    if not played(folder):
-        return INTERRUPTED
-    whole, code = True, 0
-    try:
-        if beside is not None:
-            whole = played(beside)
-            if whole:
-                code = _exit_code(beside, *_reported(beside))
-    finally:  # whatever happened to the other, this one is told
-        mine = reported(folder, time.perf_counter() - began)
-    return max(code, mine) if whole else INTERRUPTED
-
-
 def reported(folder: ResultsFolder, seconds: float) -> int:
     """Write the reports of a run that took so long [s], and print its end.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise.
     """
-    loaded, results = _reported(folder)
+    try:
+        loaded = load_run(folder.path)
+        results = report.write_reports(loaded)
+    except StorageError as error:
+        raise StorageError(f"{error}; free space, then: {command(folder, 'report')}") from None
     console.result(loaded, results, command(folder, "resume"), seconds)
     for line in _recorded(folder, loaded.records):
         print(line)
@@ -107,7 +83,7 @@ def groups(episodes: Iterable[Episode]) -> dict[Group, list[Episode]]:
 def begun(
     config: RunConfig, folder: ResultsFolder, journal: Journal
 ) -> tuple[dict[int, EpisodeRecord], dict[Group, list[Episode]]]:
-    """Say what is to be played in a folder that was settled.
+    """Say what is to be played in a folder that was prepared.
 
     Returns:
         Finished episodes by number, and those to play next, by task, tracker and mode; where none are left the folder
@@ -211,15 +187,6 @@ def _recorded(folder: ResultsFolder, records: Sequence[EpisodeRecord]) -> list[s
     from arena_newton.eval.play import recording
 
     return recording.outcome_lines(folder.config, folder.path, records)
-
-
-def _reported(folder: ResultsFolder) -> tuple[RunRecord, Results]:
-    """Write the reports of a folder."""
-    try:
-        loaded = load_run(folder.path)
-        return loaded, report.write_reports(loaded)
-    except StorageError as error:
-        raise StorageError(f"{error}; free space, then: {command(folder, 'report')}") from None
 
 
 def _exit_code(folder: ResultsFolder, loaded: RunRecord, results: Results) -> int:

@@ -12,24 +12,9 @@ from typing import Annotated, Literal, TypedDict
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.records.journal import JOURNAL_FILE, ContradictionError, EpisodeRecord, contradiction
-from arena_newton.eval.records.schema import (
-    MAX_CONFIG_BYTES,
-    MAX_EPISODES,
-    Count,
-    Facts,
-    Fit,
-    Json,
-    JsonObject,
-    Name,
-    Positive,
-    Seed,
-    fit,
-    is_name,
-    parse,
-    read_regular,
-    shown,
-)
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_EPISODES, Count, Positive, Seed
 from arena_newton.eval.records.sharding import dealt, read_shard
+from arena_newton.files.stored_json import Facts, Fit, Json, JsonObject, Name, fit, is_name, parse, read_regular, shown
 from arena_newton.rules import seeding
 
 __all__ = [
@@ -248,8 +233,8 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         before = ended.get(record.index)
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
             raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
-        if (said := contradiction(record)) is not None:
-            raise ContradictionError(f"{name}: {said}; {by_hand}, or wrong when it was written")
+        if (text := contradiction(record)) is not None:
+            raise ContradictionError(f"{name}: {text}; {by_hand}, or wrong when it was written")
         ended[record.index] = record
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated
 
-from arena_newton.eval.records.schema import Count, Fit, Json
+from arena_newton.eval.records.schema import Count
+from arena_newton.files.stored_json import Fit
 
 __all__ = ["EpisodeSignals"]
 
@@ -75,8 +75,3 @@ class EpisodeSignals:
     """Largest mean over half a second of the angle between the root's upright and its reference's [rad]*."""
     drift: Length
     """Largest difference between what the root and its reference moved within a second [m]*."""
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Json]) -> Self:
-        """The signals of a line, which were held to the annotations; names that this version does not know are left."""
-        return cls(**{name: values[name] for name in cls.__dataclass_fields__})

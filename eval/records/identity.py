@@ -17,7 +17,7 @@ from arena_newton.errors import InputError
 from arena_newton.rules.rule_types import HELD_OUT
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.tasks import TaskSpec
 
 __all__ = [

@@ -15,24 +15,9 @@ from typing import Annotated, Self
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records.episode_signals import EpisodeSignals
-from arena_newton.eval.records.schema import (
-    MAX_JOURNAL_BYTES,
-    Count,
-    Fit,
-    Json,
-    JsonObject,
-    Mode,
-    Name,
-    Positive,
-    Seed,
-    Task,
-    fit,
-    is_name,
-    parse,
-    read_regular,
-    shown,
-)
+from arena_newton.eval.records.schema import Count, Mode, Positive, Seed, Task, check_schema, read_lines
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.stored_json import Fit, Json, JsonObject, Name, is_name, loaded
 from arena_newton.files.text import counted
 from arena_newton.interfaces import EpisodeEvent
 
@@ -144,19 +129,8 @@ class EpisodeRecord:
         Raises:
             InputError: It is not a record of an episode, or a newer version wrote it.
         """
-        schema = line.get("schema", 1)
-        if type(schema) is int and schema > SCHEMA:
-            raise InputError(
-                f"{where}: schema {shown(schema)} was written by a newer version of arena_newton, this one reads up to "
-                f"{SCHEMA}"
-            )
-        fit(where, line, cls)
-        known = {key: line[key] for key in cls.__dataclass_fields__ if key in line}
-        known["phases"] = tuple((name, tick) for name, tick in line.get("phases", ()))
-        known["events"] = tuple(EpisodeEvent(**event) for event in line.get("events", ()))
-        if line.get("signals") is not None:
-            known["signals"] = EpisodeSignals.from_json(line["signals"])
-        return cls(**known)
+        check_schema(where, line, SCHEMA)
+        return loaded(where, line, cls)
 
 
 class ContradictionError(InputError):
@@ -196,38 +170,12 @@ def _explain(error: OSError, path: Path, kept: str) -> StorageError:
 
 
 def read_journal(path: Path) -> tuple[list[EpisodeRecord], int]:
-    """Read a journal.
-
-    Returns:
-        The records in file order, and the length of the part that is whole [bytes]. A last line that lacks its line
-        end, as `kill -9` or a full disk leaves it, is not part of it.
+    """Read a journal: its records in file order, and the length of the part that is whole [bytes].
 
     Raises:
-        InputError: A line other than the last is not a JSON object, or a line is not a record of an episode.
+        InputError: As `schema.read_lines`, or a line is not a record of an episode.
     """
-    try:
-        data = read_regular(path, MAX_JOURNAL_BYTES)
-    except FileNotFoundError:
-        return [], 0
-    records: list[EpisodeRecord] = []
-    start = 0
-    number = 0
-    while start < len(data):
-        number += 1
-        end = data.find(b"\n", start)
-        if end < 0:
-            break
-        try:
-            line = parse(data[start:end])
-            if not isinstance(line, dict):
-                raise ValueError
-        except ValueError:
-            if end + 1 == len(data):
-                break
-            raise InputError(f"{path}: line {number} is not a JSON object; the journal was changed by hand") from None
-        records.append(EpisodeRecord.from_json(f"{path}: line {number}", line))
-        start = end + 1
-    return records, start
+    return read_lines(path, EpisodeRecord.from_json)
 
 
 class LockedLines:

@@ -1,4 +1,4 @@
-"""Contents of the files of a results folder: values that others may have written are read and checked before use.
+"""Annotations that the files of a results folder share: names that are known here, and numbers in range.
 
 Everything that is derived from a journal (tables, pages, the original's files) is written by names that are stored in
 it, and whoever reads a report may have been sent the folder. A value that fits its type here has a known name or a
@@ -7,299 +7,74 @@ number in range.
 
 from __future__ import annotations
 
-import dataclasses
-import errno
-import functools
-import json
-import math
-import os
-import stat
-import sys
-import types
-import typing
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from arena_newton.files.text import is_printable, plain_text
+from arena_newton.files.stored_json import Fit, Json, JsonObject, Known, parse, read_regular, shown
 from arena_newton.rules.rule_types import MODES
 
-__all__ = [
-    "MAX_CONFIG_BYTES",
-    "MAX_COUNT",
-    "MAX_EPISODES",
-    "MAX_JOURNAL_BYTES",
-    "MAX_SEED",
-    "Count",
-    "Facts",
-    "Fit",
-    "Json",
-    "JsonObject",
-    "Mode",
-    "Name",
-    "Positive",
-    "Seed",
-    "Task",
-    "check_types",
-    "fit",
-    "is_name",
-    "parse",
-    "read_regular",
-    "shown",
-]
-
-type Json = Any
-"""A JSON value: null, true or false, a number, text, a list or an object."""
-type JsonObject = dict[str, Json]
+__all__ = ["MAX_CONFIG_BYTES", "MAX_COUNT", "MAX_EPISODES", "MAX_JOURNAL_BYTES", "MAX_SEED", "Count", "Mode"]
+__all__ += ["Positive", "Seed", "Task", "check_schema", "read_lines"]
 
 MAX_CONFIG_BYTES = 16 << 20
 MAX_JOURNAL_BYTES = 512 << 20
 """Room for 400,000 episodes at a little more than 1 kB each."""
-MAX_DEPTH = 16
-"""Nesting of objects and arrays; ours go to 5."""
-MAX_NAME = 512
-"""Characters of a name such as a policy with its address."""
-MAX_TEXT = 1 << 16
-"""Characters of a flag's value, fewer than this."""
 MAX_COUNT = 10**7
 """Steps, repeats, episodes."""
 MAX_SEED = 2**64
 MAX_EPISODES = 200_000
 """Episodes of one plan; the benchmark's largest has 1,680."""
 
-
-def read_regular(path: Path, limit: int) -> bytes:
-    """Content of a regular file of at most ``limit`` bytes; links, pipes and devices are refused.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It is something else, too large, or cannot be read.
-    """
-    try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        link = error.errno == errno.ELOOP
-        raise InputError(f"{path}: {'is a link' if link else f'cannot be read ({error.strerror})'}") from None
-    about = os.fstat(handle)
-    if not stat.S_ISREG(about.st_mode):  # before it becomes a file object, which a folder cannot
-        os.close(handle)
-        raise InputError(f"{path}: is not a regular file")
-    with os.fdopen(handle, "rb") as file:
-        if about.st_size > limit:
-            raise InputError(f"{path}: {about.st_size:,} bytes, expected at most {limit:,}")
-        try:
-            return file.read()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def parse(data: bytes) -> Json:
-    """Strict JSON: no NaN, no infinity, no number beyond float, nothing nested too deep, no unpaired surrogate.
-
-    Raises:
-        ValueError: It is not.
-    """
-
-    def refuse(name: str) -> NoReturn:
-        raise ValueError(f"{name} is not JSON")
-
-    try:
-        text = data.decode("utf-8")
-        value = json.loads(text, parse_constant=refuse)
-        if "\\u" in text:  # an escape is the only way to an unpaired surrogate, which no file can be written with
-            json.dumps(value, ensure_ascii=False).encode("utf-8")
-    except RecursionError:
-        raise ValueError("nested too deep") from None
-    waiting = [(value, 0)]
-    while waiting:
-        part, depth = waiting.pop()
-        if depth > MAX_DEPTH:
-            raise ValueError("nested too deep")
-        if isinstance(part, float) and not math.isfinite(part):
-            raise ValueError("a number beyond range")
-        if isinstance(part, dict):
-            waiting += [(p, depth + 1) for pair in part.items() for p in pair]
-        elif isinstance(part, list):
-            waiting += [(p, depth + 1) for p in part]
-    return value
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Constraint on a stored value beyond its type; a part of its annotation."""
-
-    expected: str
-    """Noun phrase for messages, such as `a number of ticks`."""
-    test: Callable[[Json], bool] = lambda value: True
-
-
-@dataclass(frozen=True)
-class Known:
-    """A stored value is one of these names."""
-
-    names: Callable[[], Collection[str]]
-
-    def test(self, value: Json) -> bool:
-        """True if a text is one of the names."""
-        return value in self.names()
-
-
-def is_name(value: Json) -> bool:
-    """True if a value is a text that names something: not empty, not long, printable."""
-    return isinstance(value, str) and 0 < len(value) <= MAX_NAME and is_printable(value)
-
-
-def _facts(value: Json) -> bool:
-    """True if the numbers in an object, at any depth, are such that a float can hold them."""
-    waiting = [value]
-    while waiting:
-        part = waiting.pop()
-        if isinstance(part, dict):
-            waiting += part.values()
-        elif isinstance(part, list):
-            waiting += part
-        elif isinstance(part, int | float) and not isinstance(part, bool) and not _number(part):
-            return False
-    return True
-
-
-def _number(value: Json) -> bool:
-    """True if a value is a number that a float can hold: JSON's integers have no end."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-Name = Annotated[str, Fit("a name", is_name)]
 Task = Annotated[str, Known(tasks.names)]
 Mode = Annotated[str, Known(lambda: MODES)]
 Count = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_COUNT)]
 Positive = Annotated[int, Fit("a number of at least 1", lambda value: 1 <= value <= MAX_COUNT)]
 Seed = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_SEED)]
-Facts = Annotated[dict[str, Json], Fit("facts by name", _facts)]
 
 
-def tester(hint: object) -> Callable[[Json], bool]:
-    """Test of whether a stored value fits an annotation; arrays stand for tuples."""
-    if isinstance(hint, typing.TypeAliasType):
-        return tester(hint.__value__)
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Annotated:
-        both = [tester(parts[0]), *(part.test for part in parts[1:] if isinstance(part, Fit | Known))]
-        if len(both) == 2:  # the usual case, without a loop: a journal has up to millions of values
-            first, second = both
-            return lambda v: first(v) and second(v)
-        return lambda v: all(test(v) for test in both)
-    if origin is Literal:
-        return lambda v: isinstance(v, str) and v in parts
-    if origin in (types.UnionType, typing.Union):
-        choices = [tester(part) for part in parts]
-        return lambda v: any(test(v) for test in choices)
-    if origin is list or (origin is tuple and parts[1:] == (...,)):
-        each = tester(parts[0])
-        return lambda v: isinstance(v, list | tuple) and all(map(each, v))
-    if origin is tuple:
-        row = [tester(part) for part in parts]
-        return lambda v: (
-            isinstance(v, list | tuple) and len(v) == len(row) and all(t(x) for t, x in zip(row, v, strict=True))
-        )
-    if origin is dict:
-        key, value = tester(parts[0]), tester(parts[1])
-        return lambda v: isinstance(v, dict) and all(key(k) and value(x) for k, x in v.items())
-    if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or typing.is_typeddict(hint)):
-        tests, required = {key: test for key, (test, _) in _fields(hint).items()}, _required(hint)
-        more = typing.is_typeddict(hint)
-        return lambda v: (
-            isinstance(v, dict)
-            and required <= set(v)
-            and all(tests[k](x) if k in tests else more for k, x in v.items())
-        )
-    return _PLAIN[hint]
-
-
-_PLAIN: dict[object, Callable[[Json], bool]] = {
-    types.NoneType: lambda v: v is None,
-    None: lambda v: v is None,
-    Any: lambda v: True,
-    str: lambda v: isinstance(v, str),
-    bool: lambda v: isinstance(v, bool),
-    int: lambda v: type(v) is int and _number(v),
-    float: _number,
-}
-
-
-def _expected(hint: object) -> str:
-    """An annotation in words, for messages."""
-    parts = typing.get_args(hint)
-    for part in reversed(parts):
-        if isinstance(part, Fit):
-            return f"expected {part.expected}"
-        if isinstance(part, Known):
-            return f"known are {' '.join(part.names())}"
-    if typing.get_origin(hint) is Literal:
-        return f"expected {' '.join(parts)}"
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        return " or ".join([_expected(parts[0]), *(_expected(part).removeprefix("expected ") for part in parts[1:])])
-    words = {str: "text", bool: "true or false", int: "a number", float: "a number", types.NoneType: "null"}
-    return f"expected {words.get(hint, 'values of other types')}"  # type: ignore[call-overload]
-
-
-@functools.cache
-def _fields(kind: type) -> dict[str, tuple[Callable[[Json], bool], str]]:
-    """Of each field of a dataclass or a typed dictionary what tests it, and what messages say."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    return {key: (tester(hint), _expected(hint)) for key, hint in hints.items()}
-
-
-@functools.cache
-def _required(kind: type) -> frozenset[str]:
-    if typing.is_typeddict(kind):
-        required: frozenset[str] = kind.__required_keys__  # type: ignore[attr-defined]  # of a typed dictionary
-        return required
-    free = (dataclasses.MISSING, dataclasses.MISSING)
-    return frozenset(f.name for f in dataclasses.fields(kind) if (f.default, f.default_factory) == free)
-
-
-def fit(where: str, values: Mapping[str, Json], kind: type) -> None:
-    """Hold stored values to the fields of a dataclass or of a typed dictionary.
-
-    Its annotations may hold `Fit` and `Known`; values of other names are not checked. Messages begin with `where`.
+def check_schema(where: str, content: Mapping[str, Json], newest: int) -> None:
+    """Refuse a form that this version does not know.
 
     Raises:
-        InputError: One is absent or unfit.
+        InputError: A newer version wrote it.
     """
-    required = _required(kind)
-    for key, (test, expected) in _fields(kind).items():
-        if key not in values:
-            if key in required:
-                raise InputError(f"{where}: {key} is missing, {expected}")
-        elif not test(values[key]):
-            raise InputError(f"{where}: {key} is {shown(values[key])}, {expected}")
+    schema = content.get("schema", 1)
+    if type(schema) is int and schema > newest:
+        raise InputError(
+            f"{where}: schema {shown(schema)} was written by a newer version of arena_newton, this one reads up to "
+            f"{newest}"
+        )
 
 
-def shown(value: Json) -> str:
-    """A stored value for a message."""
-    return plain_text(json.dumps(value, ensure_ascii=True), 60)
+def read_lines[T](path: Path, record: Callable[[str, JsonObject], T]) -> tuple[list[T], int]:
+    """Lines of a journal; `record` makes one of where it is and its object.
 
-
-def check_types(where: str, values: Mapping[str, Json], kind: type) -> JsonObject:
-    """Values of a dataclass that were stored as JSON; arrays become tuples, texts are printable.
+    Returns:
+        The records in file order, and the length of the part that is whole [bytes]. A last line that lacks its line
+        end, as `kill -9` or a full disk leaves it, is not part of it.
 
     Raises:
-        InputError: An unknown field, or a value of another type.
+        InputError: A line other than the last is not a JSON object, or no record is made of a line.
     """
-    hints = typing.get_type_hints(kind)
-    found = {}
-    for key, value in values.items():
-        if key not in hints:
-            raise InputError(f"{where}: {plain_text(key, 60)} is not an option, known are {' '.join(hints)}")
-        texts = [part for part in (value if isinstance(value, list) else [value]) if isinstance(part, str)]
-        if not _fields(kind)[key][0](value) or not all(len(t) < MAX_TEXT and is_printable(t) for t in texts):
-            hint = hints[key]
-            name = hint.__name__ if type(hint) is type else str(hint).replace("typing.", "")
-            raise InputError(f"{where}: {key} is {shown(value)}, expected {name}")
-        found[key] = tuple(value) if isinstance(value, list) else value
-    return found
+    try:
+        data = read_regular(path, MAX_JOURNAL_BYTES)
+    except FileNotFoundError:
+        return [], 0
+    found: list[T] = []
+    start = 0
+    while (end := data.find(b"\n", start)) >= 0:
+        where = f"{path}: line {len(found) + 1}"
+        try:
+            line = parse(data[start:end])
+            if not isinstance(line, dict):
+                raise ValueError
+        except ValueError:
+            if end + 1 == len(data):
+                break
+            raise InputError(f"{where} is not a JSON object; the journal was changed by hand") from None
+        found.append(record(where, line))
+        start = end + 1
+    return found, start

@@ -76,8 +76,10 @@ def _scheduled(text: str, environ: Mapping[str, str]) -> Shard:
         if given is None and default is not None:
             return default
         if given is None or not re.fullmatch("[0-9]{1,9}", given):
-            said = "is not set" if given is None else f"is {plain_text(given, 40) or 'empty'}"
-            raise InputError(f"--shard {text}: SLURM_ARRAY_TASK_{name} {said}; submit an array, such as --array=1-16")
+            message = "is not set" if given is None else f"is {plain_text(given, 40) or 'empty'}"
+            raise InputError(
+                f"--shard {text}: SLURM_ARRAY_TASK_{name} {message}; submit an array, such as --array=1-16"
+            )
         return int(given)
 
     task = number("ID")

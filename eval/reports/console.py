@@ -9,11 +9,10 @@ from arena_newton.eval.folders.results import Results, RunRecord
 from arena_newton.eval.folders.run_folder import BREAK_FILE, setting
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.reports import report
-from arena_newton.eval.reports.learned_row import row_results
 from arena_newton.eval.reports.progress import duration, simulated
 from arena_newton.eval.statistics import stats
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["announce", "broken", "environment", "failed", "result"]
@@ -88,8 +87,7 @@ def failed(group: str, error: OSError) -> str:
 
 def result(run: RunRecord, results: Results, resume: str, seconds: float) -> None:
     """Print the table, what a reader must know besides it, why episodes ended as errors, and the command to resume."""
-    beside = row_results(run)
-    print(f"\n{report.table(results, beside)}")
+    print(f"\n{report.table(results)}")
     for note in report.notes(run, results):
         print(note)
     reasons = stats.error_reasons(run.records)
@@ -98,6 +96,5 @@ def result(run: RunRecord, results: Results, resume: str, seconds: float) -> Non
         for cause in reasons:
             print(f"  {cause['count']:>4} x {cause['reason']}: {cause['message']}")
         print(f"Run them again with: {resume} --retry-errors")
-    played = results["finished"] + (beside["finished"] if beside is not None else 0)
-    print(f"{counted(played, 'episode')}, this run took {duration(seconds)}")
+    print(f"{counted(results['finished'], 'episode')}, this run took {duration(seconds)}")
     print(f"report: {run.folder / 'report.html'}")

@@ -69,7 +69,7 @@ def failures_markdown(cells: Sequence[FailureCell]) -> list[str]:
         "- near a bar: failures with a signal within a tenth of the bar that decides their stage",
     ]
     own = [(" ".join(_names(cell)), _own(cell)) for cell in cells]
-    lines += ["", *(f"{name}: {said}." for name, said in own if said)] if any(said for _, said in own) else []
+    lines += ["", *(f"{name}: {text}." for name, text in own if text)] if any(text for _, text in own) else []
     lines += ["", "## Success by what the first picture shows", "", Table(_SEEN_HEAD, seen, "llllr").markdown()]
     return [*lines, "An object that is not in the first picture must be searched for, or guessed.", ""]
 
@@ -99,12 +99,12 @@ def stage_bars(cells: Sequence[FailureCell]) -> list[StageBar]:
                 share = [f"{100.0 * number / cell['episodes']:.2f}%" for number in (done, count)]
                 parts.append((name, count, share[0], share[1]))
                 done += count
-        said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        message = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         waiting, near = _endings(cell)
         endings = [f"{waiting} {WAITS}"] if waiting else []
         endings += [f"{near} near a bar"] if near else []
-        said = "; ".join(text for text in (said, ", ".join(endings), _own(cell)) if text)
+        message = "; ".join(text for text in (message, ", ".join(endings), _own(cell)) if text)
         (seen, interval), (unseen, other) = _rate(cell["seen"]), _rate(cell["unseen"])
         title = " ".join(_names(cell))
-        bars.append(StageBar(title, tuple(parts), (seen, interval), (unseen, other), said))
+        bars.append(StageBar(title, tuple(parts), (seen, interval), (unseen, other), message))
     return bars

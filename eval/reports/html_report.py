@@ -13,14 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from markupsafe import Markup
-
 from arena_newton.eval.folders.failure_rules import near_bars, stage_of, waits_in_view
 from arena_newton.eval.folders.results import Results, RunRecord
 from arena_newton.eval.records.document import Document, trackers_of
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.reports.failure_text import SENTENCES, WAITS, stage_bars
-from arena_newton.eval.reports.learned_row import ROW_FOLDER
 from arena_newton.eval.reports.wording import (
     MEDIA,
     environment_facts,
@@ -72,12 +69,6 @@ COLUMNS = (
 )
 
 
-def _linked(note: str) -> str:
-    """A note whose last word is the folder of the learned policy's row, with a link to the report in it."""
-    before, name, after = note.rpartition(f"{ROW_FOLDER}/.")
-    return Markup('{}<a href="{}/report.html">{}</a>.{}').format(before, ROW_FOLDER, name[:-1], after) if name else note
-
-
 def page(
     run: RunRecord,
     results: Results,
@@ -85,13 +76,11 @@ def page(
     notes: Sequence[str],
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
-    cells: int,
     reasons: Sequence[ErrorReason],
 ) -> str:
     """The page as text, the same for the same content byte for byte.
 
-    `head` and `rows` are the table: so many `cells`, a row each, then a row per suite; `notes` what a reader must know
-    besides it.
+    `head` and `rows` are the table, a row per cell, then a row per suite; `notes` what a reader must know besides it.
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
@@ -105,9 +94,9 @@ def page(
         sources=FILES | {"media-src": FILES["img-src"]},
         results=results,
         facts=_facts(document, results),
-        notes=[_linked(note) for note in notes],
+        notes=notes,
         changes=document.get("variant_changes") or [],
-        table=_table(head, rows, cells),
+        table=_table(head, rows, len(results["cells"])),
         outcomes=OUTCOMES,
         ticks=TICKS,
         cells=_bars(results["cells"]),

@@ -10,7 +10,6 @@ from arena_newton.eval.plan.rounds import LOOK_EVERY
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports import html_report
 from arena_newton.eval.reports.failure_text import failures_markdown
-from arena_newton.eval.reports.learned_row import ROW_FOLDER, row_results
 from arena_newton.eval.reports.wording import environment_facts, media_of, rules_that_ran, tasks_of
 from arena_newton.eval.statistics.stats import ResultCell, Suite, error_reasons, outside_suites
 from arena_newton.files.text import counted, plain
@@ -57,21 +56,13 @@ def _suite_text(suite: Suite) -> list[str]:
     ]
 
 
-def _cells(results: Results, beside: Results | None) -> list[ResultCell]:
-    return [*results["cells"], *(beside["cells"] if beside is not None else [])]
+def _rows(results: Results) -> list[list[str]]:
+    return [*map(_cell_text, results["cells"]), *map(_suite_text, results["suites"])]
 
 
-def _rows(results: Results, beside: Results | None) -> list[list[str]]:
-    cells = [_cell_text(cell) for cell in _cells(results, beside)]
-    return cells + [_suite_text(suite) for suite in results["suites"]]
-
-
-def table(results: Results, beside: Results | None = None) -> str:
-    """The result table as Markdown with aligned columns; it is also what the command line prints.
-
-    `beside` are the results of `learned_row`, whose cells come after the run's own.
-    """
-    return Table(_HEAD, _rows(results, beside), "llllr").markdown()
+def table(results: Results) -> str:
+    """The result table as Markdown with aligned columns; it is also what the command line prints."""
+    return Table(_HEAD, _rows(results), "llllr").markdown()
 
 
 def table_csv(results: Results) -> str:
@@ -115,12 +106,6 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     if "seed_range" in results["config"]:
         noise = " and disturbed execution" if results["config"].get("disturbance") else ""
         found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")
-    beside = row_results(run)
-    if beside is not None:
-        more = "" if beside["complete"] else f", of which {beside['finished']} of {beside['planned']} are finished"
-        found.append(
-            f"The episodes of policy learned{more}, their strips and a report of their own are in {ROW_FOLDER}/."
-        )
     rule = width_rule(results["config"])
     if rule is not None:
         found.append(
@@ -129,9 +114,9 @@ def notes(run: RunRecord, results: Results) -> list[str]:
         )
     late, replan = results["config"].get("latency_ticks", 0), results["config"].get("replan")
     if late:
-        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's look.")
+        found.append(f"Each chunk starts {counted(late, 'tick')} ({1000 * late * TICK:g} ms) after the policy's query.")
     if replan:
-        found.append(f"The policy looks again after {counted(replan, 'action')} of each chunk.")
+        found.append(f"The policy is queried again after {counted(replan, 'action')} of each chunk.")
     if results["config"].get("ensemble"):
         found.append("At each tick the mean of all chunks that cover it is executed.")
     return found + changed_conditions(run)
@@ -146,7 +131,7 @@ def _markdown(run: RunRecord, results: Results) -> str:
     lines = [f"# HumanoidArena results {escaped(results['config_hash'])}", ""]
     lines += [f"> {escaped(note)}" for note in notes(run, results)]
     lines += [f"> The scene is a variant: {escaped(text)}" for text in run.document.get("variant_changes", [])]
-    lines += ["", table(results, row_results(run))]
+    lines += ["", table(results)]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
         "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start happened while the",
@@ -184,11 +169,7 @@ def _markdown(run: RunRecord, results: Results) -> str:
 
 def _html(run: RunRecord, results: Results) -> str:
     reasons = error_reasons(run.records)
-    beside = row_results(run)
-    rows, cells = _rows(results, beside), len(_cells(results, beside))
-    return html_report.page(
-        run, results, notes=notes(run, results), head=_HEAD, rows=rows, cells=cells, reasons=reasons
-    )
+    return html_report.page(run, results, notes=notes(run, results), head=_HEAD, rows=_rows(results), reasons=reasons)
 
 
 def write_reports(run: RunRecord) -> Results:
@@ -199,7 +180,7 @@ def write_reports(run: RunRecord) -> Results:
     """
     results = results_json(run)
     write_atomic(run.folder / "results.json", json.dumps(results, indent=2) + "\n")
-    write_atomic(run.folder / "table.md", table(results, row_results(run)))
+    write_atomic(run.folder / "table.md", table(results))
     write_atomic(run.folder / "table.csv", table_csv(results))
     write_atomic(run.folder / "report.md", _markdown(run, results))
     write_atomic(run.folder / "report.html", _html(run, results))

@@ -78,13 +78,13 @@ def write(runs: Sequence[RunRecord], target: Path, seconds: float, width: int, m
             _sheet(chosen, target, width)
     except OSError as error:
         raise StorageError(f"{target}: cannot be written ({error.strerror or error})") from None
-    lines = [f"{_said(record)}: {path}" for record, path in chosen]
+    lines = [f"{_caption(record)}: {path}" for record, path in chosen]
     absent = [name for name in tasks.names() if name not in {record.task for record, _ in chosen}]
     lines += [f"no recorded success of {' '.join(absent)}"] if absent else []
     return [*lines, f"{target}: {counted(len(chosen), 'task')}, {target.stat().st_size / 1e6:.2f} MB"]
 
 
-def _said(record: EpisodeRecord) -> str:
+def _caption(record: EpisodeRecord) -> str:
     return f"{plain(record.task)}, {plain(record.tracker)}: {record.steps} steps, {record.steps * TICK:.1f} s"
 
 
@@ -178,7 +178,7 @@ def _sheet(chosen: Sequence[tuple[EpisodeRecord, Path]], target: Path, width: in
         height = round(width * frames.shape[0] / frames.shape[1])
         line = np.full((LINE, width, 3), GROUND, np.uint8)
         at = (2, LINE - 8)
-        cv2.putText(line, _said(record), at, cv2.FONT_HERSHEY_SIMPLEX, LINE / 46, (60, 60, 60), 1, cv2.LINE_AA)
+        cv2.putText(line, _caption(record), at, cv2.FONT_HERSHEY_SIMPLEX, LINE / 46, (60, 60, 60), 1, cv2.LINE_AA)
         rows += [line, cv2.resize(frames, (width, height), interpolation=cv2.INTER_AREA)]
     how = [cv2.IMWRITE_JPEG_QUALITY, 88] if target.suffix == ".jpg" else []
     with replace_atomically(target) as out:

@@ -14,7 +14,7 @@ from arena_newton.cli.flags import shell_command, typed
 from arena_newton.eval.plan.options import Remote, flags_of
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import plain
 
 __all__ = [
@@ -106,11 +106,11 @@ def rules_that_ran(rule_set: Mapping[str, str], tasks: Sequence[str]) -> list[tu
     ours |= {record for name in ours for record in records[name]}
     others = {*known, *(record for found in records.values() for record in found)} - ours
     rows = []
-    for item, said in rule_set.items():
+    for item, message in rule_set.items():
         named = {*re.findall(r"\w+", plain(item)), owners.get(plain(item), "")} & set(known)
         if named and not named & set(tasks):
             continue
-        text = plain(said).replace("see the ranges below", "ranges: docs/rules.md")
+        text = plain(message).replace("see the ranges below", "ranges: docs/rules.md")
         # A remark on other tasks alone is left out; lists of tasks or of their objects keep what belongs to the run.
         for remark in re.findall(r" \([^()]*\)", text):
             named_here = set(re.findall(r"\w+", remark)) & set(known)

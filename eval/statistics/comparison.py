@@ -199,11 +199,11 @@ def _standings(outcomes: Sequence[Sequence[bool]], differing: Sequence[tuple[int
 
 def _nothing_common(contenders: Sequence[Contender]) -> str:
     """Error that lists each contender's strata, and the pairs that share one."""
-    said = "; ".join(
+    message = "; ".join(
         f"{one.name} has {', '.join(' '.join(stratum) for stratum in one.outcomes) or 'no episode'}"
         for one in contenders
     )
-    text = f"compare: nothing in common: {said}"
+    text = f"compare: nothing in common: {message}"
     sharing = [
         f"{first.name} with {second.name}"
         for first, second in itertools.combinations(contenders, 2)

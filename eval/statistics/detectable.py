@@ -30,14 +30,14 @@ def detectable_text(cells: Sequence[int]) -> str:
     """
     if not cells:
         return ""
-    said = [f"{counted(min(cells), 'episode')} per cell: {_range(min(cells))}"] if min(cells) <= MOST_PAIRS else []
+    ranges = [f"{counted(min(cells), 'episode')} per cell: {_range(min(cells))}"] if min(cells) <= MOST_PAIRS else []
     if len(cells) > 1 and sum(cells) <= MOST_PAIRS:
-        said.append(f"all {sum(cells):,}: {_range(sum(cells))}")
-    if not said:
+        ranges.append(f"all {sum(cells):,}: {_range(sum(cells))}")
+    if not ranges:
         return ""
     text = (
         "smallest difference from a success rate of 50 % that two such runs detect (McNemar's test, 5 %, power "
-        f"{100 * POWER:.0f} %): {', '.join(said)}"
+        f"{100 * POWER:.0f} %): {', '.join(ranges)}"
     )
     if " to " not in text:
         return text

@@ -13,7 +13,6 @@ from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import boschloo_exact
 
 from arena_newton.eval.statistics.stats import mcnemar
 
@@ -110,6 +109,8 @@ def _boschloo(first: int, first_episodes: int, second: int, second_episodes: int
     successes = first + second
     if successes in (0, first_episodes + second_episodes):
         return 1.0  # nothing varies, and SciPy says NaN
+    from scipy.stats import boschloo_exact  # its import takes seconds, and most tests are of paired episodes
+
     table = [[first, second], [first_episodes - first, second_episodes - second]]
     return min(1.0, float(boschloo_exact(table).pvalue))
 

@@ -10,8 +10,9 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-from scipy.stats import norm, t
+from scipy.special import stdtr, stdtrit
 
+from arena_newton.cli.intervals import Z95
 from arena_newton.eval.statistics.stats import Outcomes, contrast, within
 
 __all__ = [
@@ -78,7 +79,7 @@ class TrainedContrast:
 
     def p(self, against: float = 0.0) -> float:
         """Two-sided probability of a sum at least as far from this value by chance."""
-        return float(2 * t.sf(abs(self.middle - against) / self.error, self.freedom))
+        return float(2 * stdtr(self.freedom, -abs(self.middle - against) / self.error))
 
 
 def trained_contrast(terms: Sequence[RateTerm]) -> TrainedContrast | None:
@@ -115,7 +116,7 @@ def trained_contrast(terms: Sequence[RateTerm]) -> TrainedContrast | None:
         squared.append(own**2 / (number - 1))
     total, squares = math.fsum(variances), math.fsum(squared)
     freedom = total**2 / squares if squares else math.inf
-    half = (t.ppf(0.975, freedom) if squares else norm.ppf(0.975)) * math.sqrt(total)
+    half = (float(stdtrit(freedom, 0.975)) if squares else Z95) * math.sqrt(total)
     low, high = within(strata, found.middle - half, found.middle + half)
     return TrainedContrast(
         value=found.value,

@@ -105,7 +105,7 @@ def separation(values: np.ndarray, sources: np.ndarray, episodes: np.ndarray) ->
     if folds < 2:
         return None
     kept = values[:, values.std(axis=0) > CONSTANT]
-    told = np.zeros(len(values), dtype=bool)
+    right = np.zeros(len(values), dtype=bool)
     # Folds within each source, so that both are in every part.
     parts = np.zeros(len(values), dtype=np.int64)
     for k in (0, 1):
@@ -115,12 +115,12 @@ def separation(values: np.ndarray, sources: np.ndarray, episodes: np.ndarray) ->
     for number in range(folds):
         held = parts == number
         if kept.shape[1] == 0:
-            told[held] = sources[held] == 0  # nothing varies, so one guess for all
+            right[held] = sources[held] == 0  # nothing varies, so one guess for all
             continue
         model = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000))
         model.fit(kept[~held], sources[~held])
-        told[held] = model.predict(kept[held]) == sources[held]
-    each = {k: [told[episodes == e].mean() for e in np.unique(episodes[sources == k])] for k in (0, 1)}
+        right[held] = model.predict(kept[held]) == sources[held]
+    each = {k: [right[episodes == e].mean() for e in np.unique(episodes[sources == k])] for k in (0, 1)}
     means = [float(np.mean(each[k])) for k in (0, 1)]
     accuracy = sum(means) / 2
     variance = sum(float(np.var(each[k], ddof=1)) / len(each[k]) for k in (0, 1)) / 4
@@ -170,8 +170,8 @@ def _panel(axes: Axes, one: ActionMap) -> None:
         axes.scatter([], [], s=14, color=colours[one.names[k]], label=f"observations of {one.names[k]}")
     shades = [colours[one.names[k]] for k in one.sources[order]]
     axes.scatter(one.points[order, 0], one.points[order, 1], s=5, c=shades, alpha=0.55, linewidths=0)
-    told = f"told apart: actions {100 * one.actions.accuracy:.0f} %, states {100 * one.observations.accuracy:.0f} %"
-    axes.set_title(f"{one.task}\n{told}", fontsize=9, loc="left")
+    title = f"told apart: actions {100 * one.actions.accuracy:.0f} %, states {100 * one.observations.accuracy:.0f} %"
+    axes.set_title(f"{one.task}\n{title}", fontsize=9, loc="left")
     axes.set_xticks([])
     axes.set_yticks([])
 

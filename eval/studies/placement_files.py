@@ -1,24 +1,30 @@
-"""Files of a study of placements: one row per episode as they end, and one per placement."""
+"""A study of placements as it is played, and its files: a row per episode as they end, one per placement, a summary."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
+import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Self, TextIO
 
+from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
+from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.eval.studies.placed_play import PlacedEpisode
+from arena_newton.eval.reports.progress import Progress
+from arena_newton.eval.studies.placed_play import PlacedEpisode, PlacedWorlds
 from arena_newton.eval.studies.placement_axes import Axis
+from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["PlacedRows", "PointTally", "point_rows", "study_folder", "tallies"]
+__all__ = ["PlacedStudy", "PointTally", "point_rows", "rate_text", "study_folder", "summary_json", "tallies"]
 
 EPISODES = "episodes.csv"
 """Name of the file with one row per episode."""
@@ -52,10 +58,15 @@ class PointTally:
         """Successes of the judged episodes; NaN without any."""
         return self.successes / self.judged if self.judged else math.nan
 
+    def to_json(self) -> dict[str, object]:
+        """Its numbers and rate, null where they are NaN."""
+        told = dataclasses.asdict(self) | {"success_rate": self.rate}
+        return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in told.items()}
+
     def where(self, axes: Sequence[Axis]) -> str:
         """The placement in words."""
-        told = zip(axes, self.values, strict=True)
-        return ", ".join(f"{axis.name} {value:.3g} {axis.unit}".rstrip() for axis, value in told)
+        columns = zip(axes, self.values, strict=True)
+        return ", ".join(f"{axis.name} {value:.3g} {axis.unit}".rstrip() for axis, value in columns)
 
 
 def tallies(results: Sequence[EpisodeResult]) -> list[PointTally]:
@@ -104,7 +115,7 @@ def study_folder(out: str | None, *words: str) -> Path:
     return folder
 
 
-class PlacedRows:
+class _PlacedRows:
     """`episodes.csv`: a row is on the disk as soon as its episode has ended; `close` puts them in the plan's order."""
 
     def __init__(self, folder: Path, axes: Sequence[Axis]):
@@ -147,8 +158,57 @@ class PlacedRows:
 
     def _row(self, result: EpisodeResult) -> list[object]:
         placed: PlacedEpisode = result.episode
-        told = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
-        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *told]
+        columns = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
+        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *columns]
+
+
+class PlacedStudy:
+    """Plays placements and keeps what came of them; a context that puts the rows in order."""
+
+    def __init__(self, worlds: PlacedWorlds, folder: Path, count: int):
+        """Begin a study of so many episodes in a new folder."""
+        flags = worlds.config.flags
+        self.results: list[EpisodeResult] = []
+        self.budget = worlds.config.episodes[0].max_steps
+        """Step budget of an episode [ticks]."""
+        self._worlds, self._rows, self._points = worlds, _PlacedRows(folder, worlds.axes), 0
+        self._progress = Progress(self.budget * count, planned=count)
+        self._progress.group(f"{flags.task[0]} {flags.tracker[0]} {flags.mode[0]}")
+
+    def play(
+        self, points: Sequence[tuple[float, ...]], episodes: Sequence[Episode] | None = None
+    ) -> list[EpisodeResult]:
+        """Results of placements, in their order."""
+        placed = self._worlds.placed(points, self._points, episodes)
+        self._points += len(points)
+        results = self._worlds.play(placed, self._ended, self._progress.tick)
+        self.results += results
+        return results
+
+    def _ended(self, result: EpisodeResult) -> None:
+        self._rows.add(result)
+        self._progress.episode(self.budget, round(result.sim_s / TICK))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._progress.close()
+        self._rows.close()
+
+
+def rate_text(successes: int, judged: int) -> str:
+    """Successes of judged episodes, their rate and its interval."""
+    low, high = wilson(successes, judged)
+    rate = f"{successes / judged:.1%}" if judged else "none judged"
+    return f"{successes}/{judged} ({rate}, 95 % {low:.1%} to {high:.1%})"
+
+
+def summary_json(version: int, options: PlacementOptions, axes: Sequence[Mapping[str, object]], **found: object) -> str:
+    """Summary of a study: its flags, axes and what was found, as JSON."""
+    flags = {name: value for name, value in dataclasses.asdict(options).items() if name not in ("out", "worlds")}
+    document = {"format": version, "flags": flags, "axes": axes, **found}
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def _number(value: float) -> str:
@@ -157,10 +217,10 @@ def _number(value: float) -> str:
 
 def point_rows(axes: Sequence[Axis], points: Sequence[PointTally]) -> str:
     """CSV with one row per placement."""
-    told = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
+    columns = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
     whole = io.StringIO()
     writer = csv.writer(whole, lineterminator="\n")
-    writer.writerow([*(axis.name for axis in axes), *told])
+    writer.writerow([*(axis.name for axis in axes), *columns])
     for one in points:
         counts = (one.episodes, one.successes, one.falls, one.errors)
         measured = (one.rate, one.mean_margin, one.least_margin, one.success_s)

@@ -73,8 +73,10 @@ class DatasetObservations:
             raise InputError(f"{self.root}: none of its episodes is of a known task")
         seeds = self.actions.seeds()
         trackers = sorted({seed.tracker for seed in seeds})
-        self.name = trackers[0] if len(trackers) == 1 else self.root.name
-        """The tracker that all its episodes were recorded through; the folder's name where it is not one."""
+        self.tracker = trackers[0] if len(trackers) == 1 else ""
+        """The tracker that all its episodes were recorded through; empty where it is not one."""
+        self.name = self.tracker or self.root.name
+        """That tracker, or the folder's name."""
         self._frames: Frames | None = None
 
     @property
@@ -120,11 +122,15 @@ class DatasetObservations:
         """Front pictures of rows, uint8, shape [n, H, W, 3].
 
         Raises:
-            InputError: The dataset has none, or of another size than the policy wants.
+            InputError: The dataset has none, or of another size than the policy wants; of padded ones the part within
+                the pad is taken for a policy that wants it.
         """
         if self._frames is None:
             self._frames = Frames(self.root, FRONT)
         found = np.stack([self._frames[row] for row in rows])
+        if 3 * camera.width == 4 * camera.height and found.shape[1] == found.shape[2] == camera.width:
+            top = (camera.width - camera.height) // 2
+            found = found[:, top : top + camera.height]
         if found.shape[1:3] != (camera.height, camera.width):
             height, width = found.shape[1:3]
             raise InputError(
@@ -191,6 +197,7 @@ def predict(
             task=samples.task,
             gym_id=spec.gym_id,
             instruction=spec.instruction,
+            tracker=data.tracker,
         )
         try:
             answer = policy.act(observation)

@@ -48,12 +48,12 @@ def score_of(results: Sequence[EpisodeResult], budget: int) -> float:
         results: Of one placement.
         budget: Step budget [ticks].
     """
-    told = [
+    judged = [
         1.0 - result.steps / budget if result.outcome == "success" else min(result.margin, -LEAST_FAILURE)
         for result in results
         if result.outcome != "error" and (result.outcome == "success" or math.isfinite(result.margin))
     ]
-    return math.fsum(told) / len(told) if told else math.nan
+    return math.fsum(judged) / len(judged) if judged else math.nan
 
 
 @dataclass

@@ -20,7 +20,7 @@ from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_run import CellPlayer
 from arena_newton.eval.workers.dealing import DealtRun
-from arena_newton.eval.workers.slice_events import Done, Event, Opened
+from arena_newton.eval.workers.messages import Done, Event, Opened
 from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 
 __all__ = ["run"]
@@ -130,14 +130,14 @@ class _PoolPlayer(CellPlayer):
                     self._finish(cell)
 
     def _give(self, worker: Worker) -> None:
-        """Give work to a process that waits: a slice of the run that it has open, or another run to open."""
+        """Give work to a process that waits: a batch of the run that it has open, or another run to open."""
         busy = {one.assignment.group for one in self.pool.workers if one.assignment is not None}
 
         def wanted(cell: _Cell) -> bool:
             if not cell.open or cell.dealt is None or cell.job is worker.job:
                 return cell.open
             coming = [one for one in self.pool.workers if one.job is cell.job and one.assignment is None]
-            return len(coming) < cell.dealt.slices  # no more open it than find something to play
+            return len(coming) < cell.dealt.batches  # no more open it than find something to play
 
         def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
             fresh = cell.dealt is None
@@ -178,7 +178,7 @@ class _PoolPlayer(CellPlayer):
         folder.make()
         with self.silence():
             journal = cell.held.enter_context(Journal(folder.journal))
-            folder.settle(config, journal.records)
+            folder.prepare(config, journal.records)
             folder.sweep()
             cell.held.callback(folder.sweep)
             done, waiting = begun(config, folder, journal)

@@ -15,10 +15,11 @@ from arena_newton import policies, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_NAME, JsonObject, parse, read_regular
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.eval.reports.progress import simulated
 from arena_newton.eval.suites.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
 from arena_newton.eval.suites.suite_records import SuiteCell
+from arena_newton.files.stored_json import MAX_NAME, JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, CheckpointFacts, checkpoint_folder
@@ -233,7 +234,7 @@ def check_policies(suite: SuiteFile, cells: Sequence[SuiteCell]) -> list[SuiteCe
         if cell.spec not in facts:
             facts[cell.spec], chunks[cell.spec] = None, (None, None)
             try:
-                facts[cell.spec], chunks[cell.spec] = _said(cell.spec, entries[cell.policy])
+                facts[cell.spec], chunks[cell.spec] = _described(cell.spec, entries[cell.policy])
             except InputError as error:
                 problems[cell.spec] = f"{suite.path}: [[policies]] {cell.policy}: {error}"
     if problems:
@@ -260,7 +261,7 @@ def _check_chunk(where: str, cell: SuiteCell, executed: int | None, predicted: i
         )
 
 
-def _said(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, tuple[int | None, int | None]]:
+def _described(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, tuple[int | None, int | None]]:
     """Facts of the checkpoint of a spec, and the largest numbers of actions that it executes and predicts.
 
     None for what it does not say, such as one that is somebody else's.
@@ -302,9 +303,9 @@ def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: Checkpoi
         ("trained_on", cell.trained_on, facts.trackers),
         ("trained_tasks", entry.trained_tasks, learned),
     )
-    for key, said, true in claims:
-        if said and true and set(said) != set(true):
-            raise InputError(f"{where}: {key} is {' '.join(said)}, but checkpoint {path} says {' '.join(true)}")
+    for key, declared, true in claims:
+        if declared and true and set(declared) != set(true):
+            raise InputError(f"{where}: {key} is {' '.join(declared)}, but checkpoint {path} says {' '.join(true)}")
     if learned and cell.task not in learned:
         raise InputError(
             f"{where}: checkpoint {path} was trained on {' '.join(learned)}, cell {cell.id} plays {cell.task}"

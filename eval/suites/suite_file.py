@@ -16,7 +16,8 @@ from pathlib import Path
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.records.schema import MAX_COUNT, MAX_TEXT, Json, JsonObject, check_types, shown
+from arena_newton.eval.records.schema import MAX_COUNT
+from arena_newton.files.stored_json import MAX_TEXT, Json, JsonObject, check_types, shown
 from arena_newton.files.text import is_printable, plain_text
 from arena_newton.rules.rule_types import MODES, check_name
 from arena_newton.trackers import check_spec

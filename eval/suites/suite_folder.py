@@ -228,9 +228,9 @@ def _knowing(cells: Sequence[SuiteCell], known: Mapping[str, SuiteCell]) -> Iter
         if other is None or other.spec != cell.spec or cell.config is not None:
             yield cell
             continue
-        told = {key: getattr(cell, key) or getattr(other, key) for key in ("family", "trained_on", "trained_tasks")}
+        facts = {key: getattr(cell, key) or getattr(other, key) for key in ("family", "trained_on", "trained_tasks")}
         labels = other.labels if other.config is not None else cell.labels
-        yield dataclasses.replace(cell, config=other.config, labels=labels, **told)
+        yield dataclasses.replace(cell, config=other.config, labels=labels, **facts)
 
 
 def _counts(run: RunRecord | None) -> Counts:

@@ -14,30 +14,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypedDict
 
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.records.document import SUITE_FILE
-from arena_newton.eval.records.schema import (
-    MAX_CONFIG_BYTES,
-    MAX_JOURNAL_BYTES,
-    Count,
-    Fit,
-    Json,
-    JsonObject,
-    Mode,
-    Name,
-    Positive,
-    Task,
-    fit,
-    parse,
-    read_regular,
-    shown,
-)
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, Count, Mode, Positive, Task, check_schema, read_lines
+from arena_newton.files.stored_json import Fit, Json, JsonObject, Name, fit, loaded, parse, read_regular, shown
 
 __all__ = [
     "JOURNAL_PATTERN",
@@ -102,7 +88,7 @@ class SuiteCell:
     latency: Count = 0
     """Ticks by which each chunk starts late."""
     replan: Annotated[Positive | None, Fit("a number of actions or null")] = None
-    """Actions of a chunk that are executed before the next look; None: all."""
+    """Actions of a chunk that are executed before the next query; None: all."""
     ensemble: bool = False
     """True if all chunks that cover a tick are averaged."""
     folder: Folder
@@ -167,6 +153,16 @@ class CellEvent:
     error: Annotated[str | None, Fit("text or null")] = None
 
 
+class _Plan(TypedDict):
+    """Content of `suite.json`."""
+
+    schema: Positive
+    name: str
+    source: str
+    hash: str
+    cells: Annotated[list[JsonObject], Fit("a list of objects")]
+
+
 @dataclass(frozen=True)
 class SuitePlan:
     """A suite's folder, read and checked."""
@@ -223,11 +219,9 @@ def read_suite(folder: Path) -> SuitePlan:
         raise InputError(f"{path}: not readable as JSON ({error})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object")
-    _check_schema(str(path), content)
-    for key, expected in (("name", str), ("source", str), ("hash", str), ("cells", list)):
-        if not isinstance(content.get(key), expected):
-            raise InputError(f"{path}: {key} is {shown(content.get(key))}, expected {_NOUNS[expected]}")
-    cells = [_cell(f"{path}: cells[{number}]", values) for number, values in enumerate(content["cells"])]
+    check_schema(str(path), content, SUITE_SCHEMA)
+    fit(str(path), content, _Plan)
+    cells = [loaded(f"{path}: cells[{number}]", values, SuiteCell) for number, values in enumerate(content["cells"])]
     seen: set[str] = set()
     for cell in cells:
         if cell.id in seen:
@@ -235,31 +229,6 @@ def read_suite(folder: Path) -> SuitePlan:
         seen.add(cell.id)
     plan = SuitePlan(folder, content["name"], content["source"], content["hash"], tuple(cells))
     return with_events(plan, read_events(folder))
-
-
-_NOUNS = {str: "text", list: "a list"}
-
-
-def _check_schema(where: str, content: Mapping[str, Json]) -> None:
-    schema = content.get("schema")
-    if type(schema) is not int or schema < 1:
-        raise InputError(f"{where}: schema is {shown(schema)}, expected a number of at least 1")
-    if schema > SUITE_SCHEMA:
-        raise InputError(
-            f"{where}: schema {schema} was written by a newer version of arena_newton, this one reads up to "
-            f"{SUITE_SCHEMA}"
-        )
-
-
-def _cell(where: str, values: Json) -> SuiteCell:
-    """A cell of `suite.json`; keys that this version does not know are left out."""
-    if not isinstance(values, dict):
-        raise InputError(f"{where}: expected an object")
-    fit(where, values, SuiteCell)
-    known = {field.name: values[field.name] for field in dataclasses.fields(SuiteCell) if field.name in values}
-    for key in ("trained_on", "trained_tasks"):
-        known[key] = tuple(known[key])
-    return SuiteCell(**known)
 
 
 def read_events(folder: Path) -> list[CellEvent]:
@@ -281,28 +250,12 @@ def read_journal_events(path: Path) -> tuple[list[CellEvent], int]:
     Raises:
         InputError: A line other than the last is damaged, or a newer version wrote it.
     """
-    try:
-        data = read_regular(path, MAX_JOURNAL_BYTES)
-    except FileNotFoundError:
-        return [], 0
-    found: list[CellEvent] = []
-    start = number = 0
-    while (end := data.find(b"\n", start)) >= 0:
-        number += 1
-        where = f"{path}: line {number}"
-        try:
-            line = parse(data[start:end])
-            if not isinstance(line, dict):
-                raise ValueError
-        except ValueError:
-            if end + 1 == len(data):
-                break
-            raise InputError(f"{where} is not a JSON object; the journal was changed by hand") from None
-        _check_schema(where, line)
-        fit(where, line, CellEvent)
-        found.append(CellEvent(**{f.name: line[f.name] for f in dataclasses.fields(CellEvent) if f.name in line}))
-        start = end + 1
-    return found, start
+
+    def event(where: str, line: JsonObject) -> CellEvent:
+        check_schema(where, line, SUITE_SCHEMA)
+        return loaded(where, line, CellEvent)
+
+    return read_lines(path, event)
 
 
 def event_line(event: CellEvent) -> bytes:

@@ -27,7 +27,7 @@ from arena_newton.eval.suites.suite_file import SuiteFile
 from arena_newton.eval.suites.suite_folder import SuiteFolder
 from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.eval.suites.suite_records import CellEnding, CellEvent, SuiteCell
-from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.eval.workers.batch_player import device_name
 from arena_newton.files.text import counted, plain_text
 from arena_newton.rules.seeding import policy_seed
 
@@ -174,14 +174,14 @@ class CellPlayer:
             if difference is None:
                 continue
             key, was, now, is_code = difference
-            said = f"{name}: {key} was {setting(was)}, now {setting(now)}"
+            text = f"{name}: {key} was {setting(was)}, now {setting(now)}"
             finished = len(run.records) == run.document["planned"]
             if not is_code:
-                changed.append(said)
+                changed.append(text)
             elif finished and self.options.accept_code:
                 continue
             elif not (self.options.accept_code and not finished):
-                code.append(said)
+                code.append(text)
             names.append(name)
         if changed and not self.options.accept_changes:
             raise InputError(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.comparison import LEVEL, Comparison, PairComparison, Standing, StratumPair
 from arena_newton.eval.statistics.rate_tests import LARGEST_BOSCHLOO, PairedCounts, UnpairedCounts
 from arena_newton.eval.statistics.stats import Contrast
 from arena_newton.eval.tables.contenders import ContenderSet
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between, escaped, percent
 

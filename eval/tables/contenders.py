@@ -10,10 +10,10 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, changed_conditions, is_complete, width_rule
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json, shown
 from arena_newton.eval.statistics.comparison import Contender
 from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, read_folder, runs_of
+from arena_newton.files.stored_json import Json, shown
 from arena_newton.files.text import counted, plain_text
 from arena_newton.tasks.semantic_mode import semantic_notes
 
@@ -180,12 +180,12 @@ def _of_folder(folder: Path, title: str, alone: bool, per_tracker: bool, notes: 
     several = len({cell.records[0].shown_policy for cell in cells}) > 1
     found: dict[tuple[str, ...], Compared] = {}
     for cell in cells:
-        policy, words, said = cell.records[0].shown_policy if several else "", tuple[str, ...](), list[str]()
+        policy, words, differing = cell.records[0].shown_policy if several else "", tuple[str, ...](), list[str]()
         if cell.planned is not None:
             policy, words = cell.planned.policy, _conditions(cell.planned)
-            said = [word for word, *others in zip(words, *alike[policy], strict=True) if len(set(others)) > 1]
+            differing = [word for word, *others in zip(words, *alike[policy], strict=True) if len(set(others)) > 1]
         tracker = cell.tracker if per_tracker else ""
-        name = " ".join(filter(None, ["" if alone and suite else title, policy, *said, tracker]))
+        name = " ".join(filter(None, ["" if alone and suite else title, policy, *differing, tracker]))
         found.setdefault((policy, *words, tracker), Compared(plain_text(name, None), folder)).cells.append(cell)
     return list(found.values())
 
@@ -251,12 +251,12 @@ def _check_alike(gathered: Sequence[Compared], differ: Sequence[str]) -> None:
         groups: dict[str, list[str]] = {}
         for one in gathered:
             groups.setdefault(" and ".join(one.values(name)), []).append(one.name)
-        said = "; ".join(f"{value} in {', '.join(names)}" for value, names in groups.items())
+        text = "; ".join(f"{value} in {', '.join(names)}" for value, names in groups.items())
         alike = [", ".join(names) for value, names in groups.items() if len(names) > 1]
         alone = f"; alike, and to be compared, are: {' or: '.join(alike)}" if alike else ""
         flag = "--max-steps" if name == "max_steps" else name
         raise InputError(
-            f"compare: {flag} differs: {said}{alone}; --differ {name} compares them nevertheless, and says so"
+            f"compare: {flag} differs: {text}{alone}; --differ {name} compares them nevertheless, and says so"
         )
 
 
@@ -268,12 +268,12 @@ def _notes(gathered: Sequence[Compared], differ: Sequence[str]) -> list[str]:
     """Conditions under which runs are no results of the benchmark, needless differences, and errors."""
     cells = [cell for one in gathered for cell in one.cells]
     runs = runs_of(cells)
-    found = list(dict.fromkeys(said for run in runs for said in changed_conditions(run)))
+    found = list(dict.fromkeys(message for run in runs for message in changed_conditions(run)))
     found += semantic_notes(cell.mode for cell in cells)
     for name in dict.fromkeys((*differ, *NOTED)):
         if not _all_alike(gathered, name):
-            said = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)
-            found.append(f"{name.replace('_', ' ').capitalize()} differs: {said}.")
+            message = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)
+            found.append(f"{name.replace('_', ' ').capitalize()} differs: {message}.")
     trackers = {one.name: " ".join(one.trackers) for one in gathered}
     if len(set(trackers.values())) > 1:
         found.append(f"Trackers differ: {'; '.join(f'{name}: {words}' for name, words in trackers.items())}.")
@@ -288,7 +288,7 @@ def _notes(gathered: Sequence[Compared], differ: Sequence[str]) -> list[str]:
         for key, what in HASHED.items()
         for versions in _versions(runs, key)
     ]
-    found += [f"{one.name}: {said}" for one in gathered if (said := error_note(one.cells))]
+    found += [f"{one.name}: {message}" for one in gathered if (message := error_note(one.cells))]
     return [plain_text(text) for text in found]
 
 

@@ -14,8 +14,8 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, check_whole_plan, is_complete, load_run
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import Json
 from arena_newton.eval.suites.suite_records import SuiteCell, SuitePlan, load_cell, read_suite
+from arena_newton.files.stored_json import Json
 from arena_newton.files.text import counted, plain, plain_text
 from arena_newton.rules import seeding
 
@@ -60,7 +60,7 @@ class EvaluatedCell:
     latency: int
     """Ticks by which each chunk started late."""
     replan: int | None
-    """Actions of a chunk that were executed before the next look; None: all."""
+    """Actions of a chunk that were executed before the next query; None: all."""
     ensemble: bool
     records: tuple[EpisodeRecord, ...]
     """Its episodes in plan order."""
@@ -156,7 +156,7 @@ def incomplete_note(run: RunRecord) -> list[str]:
 
 
 def cells_of(run: RunRecord) -> list[PlayedCell]:
-    """Cells of a results folder that is of no suite, with what the policy said of itself."""
+    """Cells of a results folder that is of no suite, with what the policy declares."""
     config: Mapping[str, Json] = run.config
     facts = _facts(config.get("policy_facts"))
     family, replan = _text(facts.get("family")), config.get("replan")
@@ -270,5 +270,5 @@ def error_note(cells: Iterable[EvaluatedCell]) -> str:
     """Number of episodes that ended with an error, in a sentence; empty without one."""
     outcomes = [record.outcome for cell in cells for record in cell.records]
     errors = outcomes.count("error")
-    said = f"{counted(errors, 'episode')} of {len(outcomes)} ended with an error; they count as no success."
-    return said if errors else ""
+    text = f"{counted(errors, 'episode')} of {len(outcomes)} ended with an error; they count as no success."
+    return text if errors else ""

@@ -12,7 +12,7 @@ from pathlib import Path
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import changed_conditions
-from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_COUNT, read_regular, shown
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES, MAX_COUNT
 from arena_newton.eval.tables.episode_table import (
     NAMED,
     EvaluatedCell,
@@ -23,6 +23,7 @@ from arena_newton.eval.tables.episode_table import (
     read_folder,
     runs_of,
 )
+from arena_newton.files.stored_json import read_regular, shown
 from arena_newton.files.text import counted, plain_text
 from arena_newton.rules.rule_types import MODES
 

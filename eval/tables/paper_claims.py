@@ -65,7 +65,7 @@ type Test = tuple[Verdict, float]
 UNTESTED: Test = ("not measured", 1.0)
 
 
-def _said(found: TrainedContrast | None, of: str) -> str:
+def _described(found: TrainedContrast | None, of: str) -> str:
     if found is None:
         return "no common episodes"
     spread = (
@@ -191,16 +191,16 @@ def _same_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
             if (c := trained_contrast(terms)) is not None:
                 tested.append((f"{recipe} {task}", c))
     test = UNTESTED
-    said = "no policy was evaluated matched through both trackers"
+    text = "no policy was evaluated matched through both trackers"
     if tested:
         tests = [_different(c, WIDE) for _, c in tested]
         adjusted = holm([p if verdict == "reproduces" else 1.0 for verdict, p in tests])
         apart = sum(p < SIGNIFICANT for p in adjusted)
         least = min(range(len(tested)), key=lambda k: (adjusted[k], -abs(tested[k][1].value), tested[k][0]))
         name, c = tested[least]
-        said = (
+        text = (
             f"{apart} of {len(tested)} pairs of cells differ by more than {100 * NEGLIGIBLE:.0f} points (Holm); "
-            f"most: {name} {_said(c, 'twist2 minus sonic')}"
+            f"most: {name} {_described(c, 'twist2 minus sonic')}"
         )
         test = "reproduces", adjusted[least]
         if all(verdict == "does not" for verdict, _ in tests):
@@ -214,7 +214,7 @@ def _same_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
         "tracker-conditioned: same family",
         "The same policy family succeeds differently when it is trained and executed with another tracker.",
         f"most: {_named(family)} {task}, {100 * first:.1f} % with TWIST2, {100 * second:.1f} % with SONIC",
-        said,
+        text,
         test,
     )
 
@@ -265,7 +265,7 @@ def _common(cells: _Cells, trackers: Sequence[str], among: Sequence[str]) -> _Co
 def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
     compared = _common(cells, ("twist2", "sonic"), suites()["ALL_AVG"])
     test = UNTESTED
-    said = "fewer than two policies were evaluated matched through both trackers on common tasks"
+    text = "fewer than two policies were evaluated matched through both trackers on common tasks"
     if compared is not None and len(compared.recipes) > 1:
         tasks = compared.tasks
         top = {t: [name for _, name in _ranked(cells, t, compared.recipes, tasks)] for t in ("twist2", "sonic")}
@@ -280,12 +280,12 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
             shown = [lead(t, a, top[t][1]) for t in top]
             test = "does not", _leads(leads)
             seconds = " and ".join(dict.fromkeys((top["twist2"][1], top["sonic"][1])))
-            said = f"{a} is best with both; leads over the second, {seconds}:"
+            text = f"{a} is best with both; leads over the second, {seconds}:"
         else:
             shown = [lead("twist2", a, b), lead("sonic", b, a)]
             test = "reproduces", _leads(shown)
-            said = f"{a} is best with twist2, {b} with sonic; leads over the other:"
-        said += f" {_said(shown[0], 'twist2')} and {_said(shown[1], 'sonic')}. Compared: {compared}"
+            text = f"{a} is best with twist2, {b} with sonic; leads over the other:"
+        text += f" {_described(shown[0], 'twist2')} and {_described(shown[1], 'sonic')}. Compared: {compared}"
     theirs = []
     for tracker, suite in itertools.product(("twist2", "sonic"), HALVES):
         rate = max((paper.in_gmt[tracker, "base", f, suite] for f in FAMILIES.values()), key=lambda r: r.sr)
@@ -294,7 +294,7 @@ def _best_family(cells: _Cells, paper: PaperNumbers) -> ClaimResult:
         "tracker-conditioned: best family",
         "The best policy under one tracker is not the best under the other.",
         "; ".join(theirs),
-        said,
+        text,
         test,
     )
 
@@ -303,7 +303,7 @@ def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     found = []
     for suite in HALVES:
         compared = _common(cells, ("twist2", "sonic"), suites()[suite])
-        result, said = None, "no policy was evaluated matched through both trackers on tasks of the suite"
+        result, text = None, "no policy was evaluated matched through both trackers on tasks of the suite"
         if compared is not None:
             best = {t: _ranked(cells, t, compared.recipes, compared.tasks)[0][1] for t in ("twist2", "sonic")}
             result = trained_contrast(
@@ -311,7 +311,7 @@ def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
                 + cells.mean("twist2", best["twist2"], compared.tasks, -1.0)
             )
             of = f"{best['sonic']} with sonic minus {best['twist2']} with twist2"
-            said = f"{_said(result, of)}. Compared: {compared}"
+            text = f"{_described(result, of)}. Compared: {compared}"
         theirs = {t: max(paper.in_gmt[t, "base", f, suite].sr for f in FAMILIES.values()) for t in ("twist2", "sonic")}
         name = suite.removesuffix("_AVG")
         found.append(
@@ -319,7 +319,7 @@ def _better_tracker(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
                 f"tracker-conditioned: SONIC ahead on {name}",
                 f"The best average over {name} is higher with SONIC than with TWIST2.",
                 f"{points(theirs['sonic'] - theirs['twist2'])} points",
-                said,
+                text,
                 _greater(result),
             )
         )
@@ -366,13 +366,15 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
             for pairs in mine.values()
         )
         lost = sum(c.retention == 0 for c in theirs)
-        said = f"{_said(result, f'{len(mine)} cells')}; nothing left in {gone} of {len(mine)}" if mine else _NO_SWAP
+        text = (
+            f"{_described(result, f'{len(mine)} cells')}; nothing left in {gone} of {len(mine)}" if mine else _NO_SWAP
+        )
         found.append(
             _result(
                 f"cross-GMT: {a} → {b}",
                 "Replacing the tracker costs success.",
                 f"{points(means[a][0])} points on average; nothing left in {lost} of {len(theirs)} cells",
-                said,
+                text,
                 _greater(result),
             )
         )
@@ -384,7 +386,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
             "cross-GMT: asymmetric drop",
             "The two directions differ in the drop of success.",
             f"{points(means['twist2'][0] - means['sonic'][0])} points more from TWIST2 to SONIC",
-            _said(result, f"{len(both)} cells a direction") if both else _NO_SWAP,
+            _described(result, f"{len(both)} cells a direction") if both else _NO_SWAP,
             _different(result),
         )
     )
@@ -398,7 +400,7 @@ def _swapped(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
             "cross-GMT: asymmetric falls",
             "Swapped policies fall more often from SONIC to TWIST2 than in the other direction.",
             f"{points(means['sonic'][1] - means['twist2'][1])} points",
-            f"{_said(falls, f'{len(both)} cells a direction')}; {fell} in all" if both else _NO_SWAP,
+            f"{_described(falls, f'{len(both)} cells a direction')}; {fell} in all" if both else _NO_SWAP,
             _greater(falls),
         )
     )
@@ -446,14 +448,16 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
     for name, claim, weights in compared:
         kept = chosen(weights, every)
         result = trained_contrast(terms(weights, kept))
-        said = (
-            _said(result, f"{len(kept)} cells") if kept else f"no cell was evaluated in modes {' and '.join(weights)}"
+        text = (
+            _described(result, f"{len(kept)} cells")
+            if kept
+            else f"no cell was evaluated in modes {' and '.join(weights)}"
         )
         if kept and "semantic" in weights:
-            said += f". Semantic mode costs, by what it changes: {_by_change(chosen(('base', 'semantic'), every))}"
-        paper_said = f"{points(theirs(weights, every))} points"
+            text += f". Semantic mode costs, by what it changes: {_by_change(chosen(('base', 'semantic'), every))}"
+        paper_text = f"{points(theirs(weights, every))} points"
         remark = semantic_note() if "semantic" in weights else ""
-        found.append(_result(f"perturbation: {name}", claim, paper_said, said, _greater(result), remark))
+        found.append(_result(f"perturbation: {name}", claim, paper_text, text, _greater(result), remark))
     drop = compared[0][2]
     halves = [chosen(drop, suites()[suite]) for suite in HALVES]
     result = trained_contrast(terms(drop, halves[0]) + terms(drop, halves[1], -1.0)) if all(halves) else None
@@ -464,7 +468,7 @@ def _visual(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
             "perturbation: visual on HOI",
             "Visual perturbations cost more on human-object than on human-scene tasks.",
             f"{points(first - second)} points",
-            _said(result, of) if result else "not both suites in mode visual",
+            _described(result, of) if result else "not both suites in mode visual",
             _greater(result),
         )
     )
@@ -480,8 +484,8 @@ def _by_change(kept: Sequence[_Modes]) -> str:
         ]
         change = tasks.get(group["base"][0].task).semantic_change or "other"
         drops.setdefault(change, []).append(sum(rates[0]) / len(rates[0]) - sum(rates[1]) / len(rates[1]))
-    said = (f"{name} {points(sum(d) / len(d))} ({counted(len(d), 'cell')})" for name, d in sorted(drops.items()))
-    return ", ".join(said)
+    parts = (f"{name} {points(sum(d) / len(d))} ({counted(len(d), 'cell')})" for name, d in sorted(drops.items()))
+    return ", ".join(parts)
 
 
 def _stability(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
@@ -493,15 +497,15 @@ def _stability(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
         theirs = f"highest success: {_named(most)}, fewest falls: {_named(least)} ({100 * rates[least][0].afr:.2f} %)"
         compared = _common(cells, (tracker,), suites()["ALL_AVG"])
         test = UNTESTED
-        said = "fewer than two policies were evaluated on common tasks"
+        text = "fewer than two policies were evaluated on common tasks"
         if compared is not None and len(compared.recipes) > 1:
             recipes, tasks = compared.recipes, compared.tasks
             falls = {p: sum(term.part for term in cells.falls(tracker, p, tasks)) for p in recipes}
             best = _ranked(cells, tracker, recipes, tasks)[0][1]
             calm = min(recipes, key=lambda p: (falls[p], p != best, p))
-            said = f"highest success: {best}, fewest falls: {calm} ({100 * falls[calm]:.2f} %)"
+            text = f"highest success: {best}, fewest falls: {calm} ({100 * falls[calm]:.2f} %)"
             if max(falls.values()) == 0.0:
-                said, test = f"highest success: {best}; no policy fell, so falls rank nothing", ("undecided", 1.0)
+                text, test = f"highest success: {best}; no policy fell, so falls rank nothing", ("undecided", 1.0)
             else:
                 others = [p for p in recipes if p != best] if best == calm else [calm]
                 leads = [
@@ -514,15 +518,15 @@ def _stability(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
                     fewer = trained_contrast(
                         [*cells.falls(tracker, best, tasks), *cells.falls(tracker, calm, tasks, -1.0)]
                     )
-                    said += f"; success {_said(leads[0], 'difference')}, falls {_said(fewer, 'difference')}"
+                    text += f"; success {_described(leads[0], 'difference')}, falls {_described(fewer, 'difference')}"
                     test = "reproduces", _leads([*leads, fewer])
-            said += f". Compared: {compared}"
+            text += f". Compared: {compared}"
         found.append(
             _result(
                 f"SR and AFR disagree: {tracker}",
                 "The policy that falls least is not the one that succeeds most.",
                 theirs,
-                said,
+                text,
                 test,
             )
         )
@@ -551,16 +555,16 @@ def _merged(cells: _Cells, paper: PaperNumbers) -> list[ClaimResult]:
                 test = "reproduces", min(1.0, min(changed) * len(changed))
             elif tests:
                 test = "does not", max(p for _, p in tests)
-            said = "; ".join(f"{family}: {_said(c, 'merged minus single')}" for family, c in results)
+            text = "; ".join(f"{family}: {_described(c, 'merged minus single')}" for family, c in results)
             half = suite.removesuffix("_AVG")
             found.append(
                 _result(
                     f"merged training: {name} {half}",
                     "Merged demonstrations change the success rate, for better or worse.",
                     f"{', '.join(theirs)} points",
-                    said or "no merged policy next to single ones of its family",
+                    text or "no merged policy next to single ones of its family",
                     test,
-                    _CONFOUNDED if said else "",
+                    _CONFOUNDED if text else "",
                 )
             )
     return found

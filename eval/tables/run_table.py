@@ -63,10 +63,10 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
 
 def _policy(cell: EvaluatedCell) -> str:
     """A cell's policy; how it executed chunks, where that is not the usual, belongs to its name."""
-    said = [f"looks every {counted(cell.replan, 'tick')}"] if cell.replan else []
-    said += ["ensembled"] if cell.ensemble else []
-    said += [f"{counted(cell.latency, 'tick')} late"] if cell.latency else []
-    return ", ".join([cell.records[0].shown_policy, *said])
+    text = [f"queried every {counted(cell.replan, 'tick')}"] if cell.replan else []
+    text += ["ensembled"] if cell.ensemble else []
+    text += [f"{counted(cell.latency, 'tick')} late"] if cell.latency else []
+    return ", ".join([cell.records[0].shown_policy, *text])
 
 
 def _check_unique(found: Sequence[tuple[str, EvaluatedCell]]) -> None:

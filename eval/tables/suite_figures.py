@@ -93,13 +93,13 @@ def _bars(table: SuiteTable, panel: str = "tracker") -> Figure | None:
     for axes, name in zip(all_axes[:, 0], panels, strict=True):
         for number, (policy, family) in enumerate(policies):
             colour = COLOURS[number % len(COLOURS)]
-            said = False
+            labelled = False
             for column, task in enumerate(tasks):
                 mine = [e for e in ours if (getattr(e, panel), e.policy, e.task) == (name, policy, task)]
                 x = column - 0.42 + width * (number + 0.5)
                 if mine and mine[0].sr is not None:
-                    _bar(axes, x, width, mine[0], colour, label=None if said else policy)
-                    said = True
+                    _bar(axes, x, width, mine[0], colour, label=None if labelled else policy)
+                    labelled = True
                 paper = theirs.get((name, family, task))
                 if mine and paper is not None and paper.sr is not None:
                     _diamond(axes, x, paper)

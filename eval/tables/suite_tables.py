@@ -321,12 +321,12 @@ def _cross_gmt(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTabl
                     if base is None:
                         continue
                     theirs = paper.cross_gmt.get((a, b, family, task))
-                    said = ("", "", "")
+                    printed = ("", "", "")
                     if theirs is not None:
                         whole = paper.in_gmt[a, "base", family, task].sr > 0
                         kept = percent(theirs.retention) if whole else UNDEFINED
-                        said = (points(theirs.drop), kept, percent(theirs.task_afr, 2))
-                    pairs.append(RowPair(base, cell, (f"{a} → {b}", task_title(task), policy), said))
+                        printed = (points(theirs.drop), kept, percent(theirs.task_afr, 2))
+                    pairs.append(RowPair(base, cell, (f"{a} → {b}", task_title(task), policy), printed))
     if not pairs:
         return None
     rows, entries = paired_rows("cross_gmt", pairs)

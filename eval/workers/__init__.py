@@ -1,1 +1,1 @@
-"""Episodes played by other processes: slices of a plan, clusters, and shards that are merged."""
+"""Episodes played by other processes: batches of a plan, clusters, and shards that are merged."""

@@ -1,4 +1,4 @@
-"""A process that plays slices of runs: it is given numbers of episodes and gives journal lines back.
+"""A process that plays batches of runs: it is given numbers of episodes and gives journal lines back.
 
 It is imported before the process knows its cores and GPU, so torch, Warp and what needs them load inside the methods.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.workers.slice_events import Broke, Event, Node, Opened, Slice, broke
+from arena_newton.eval.workers.messages import Broke, EpisodeBatch, Event, Node, Opened, broke
 
 if TYPE_CHECKING:
     from arena_newton.eval.plan.config import RunConfig
@@ -57,7 +57,7 @@ class EpisodeActor:
         self._folder = Path(folder)
         return self._thread.submit(self._open, options, factories).result()
 
-    def play(self, part: Slice) -> Iterator[Event]:
+    def play(self, part: EpisodeBatch) -> Iterator[Event]:
         """Play episodes; gives what happens when it happens."""
         events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
         self._thread.submit(self._play, part, events)
@@ -67,7 +67,7 @@ class EpisodeActor:
     def _open(self, options: RunOptions, factories: Factories | None) -> Broke | Opened:
         try:
             from arena_newton.doctor import versions
-            from arena_newton.eval.workers.slice_player import device_name, parts
+            from arena_newton.eval.workers.batch_player import device_name, parts
 
             policy, self._policy = self._policy, None
             if policy is not None:
@@ -86,9 +86,9 @@ class EpisodeActor:
         except (Exception, SystemExit) as error:
             return broke(error)
 
-    def _play(self, part: Slice, events: queue.SimpleQueue[Event | None]) -> None:
+    def _play(self, part: EpisodeBatch, events: queue.SimpleQueue[Event | None]) -> None:
         try:
-            from arena_newton.eval.workers.slice_player import play
+            from arena_newton.eval.workers.batch_player import play
 
             assert self._policy is not None and self._factories is not None, "plays before it has opened a run"
             play(part, self._config, self._folder, self._factories, self._policy, events.put)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from arena_newton.eval.workers.slice_events import Done, Event, Node, Opened
+from arena_newton.eval.workers.messages import Done, Event, Node, Opened
 
 __all__ = ["PoolBackend", "Process", "WorkerLost"]
 
@@ -44,7 +44,7 @@ class PoolBackend(Protocol):
     gpus: float
     """GPUs of each process."""
     minutes: float
-    """Deadline of a slice [min]."""
+    """Deadline of a batch [min]."""
 
     def room(self) -> int:
         """Processes that there is room for now."""

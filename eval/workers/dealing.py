@@ -1,4 +1,4 @@
-"""``run --jobs`` and ``run --ray``: processes play slices of the plan; this one deals them out and owns the journal.
+"""``run --jobs`` and ``run --ray``: processes play batches of the plan; this one deals them out and owns the journal.
 
 Numbers of episodes go out, journal lines come back; pictures and recordings are written by the processes themselves
 into the results folder. This process loads neither Warp nor torch for it.
@@ -14,6 +14,7 @@ from collections.abc import Callable
 from math import ceil
 from typing import TYPE_CHECKING
 
+from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.run_folder import BREAK_FILE, ResultsFolder, iso
 from arena_newton.eval.plan.episode_plan import Episode
@@ -26,13 +27,13 @@ from arena_newton.eval.play.run_flow import (
     due,
     kept,
     progress_of,
-    run_and_report,
+    reported,
     told_how_to_go_on,
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.backend import PoolBackend
-from arena_newton.eval.workers.slice_events import Built, Done, Ended, Event, Opened, Ticks
+from arena_newton.eval.workers.messages import Built, Done, Ended, Event, Opened, Ticks
 from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 from arena_newton.files.text import plain_text
 from arena_newton.robot.g1 import TICK
@@ -42,23 +43,22 @@ if TYPE_CHECKING:
 
 __all__ = ["DealtRun", "execute"]
 
-BATCHES = 2
-"""Most episodes of a slice, in batches of --worlds."""
+LARGEST = 2
+"""Most episodes of a batch for each of --worlds."""
 SMALLER = 4
-"""Episodes that were running when a process was lost are played again in slices so many times smaller, then alone."""
+"""Episodes that were running when a process was lost are played again in batches so many times smaller, then alone."""
 ALONE = 2
 """Losses after which an episode is played alone."""
 GIVEN_UP = 5
 """So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
 
 
-def execute(folder: ResultsFolder, factories: Factories | None = None, beside: ResultsFolder | None = None) -> int:
-    """Run or continue the run of a folder that was checked, and that of a folder inside, by other processes.
+def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
+    """Run or continue the run of a folder that was checked by other processes.
 
     Args:
         folder: Of the run; its flags say which processes.
         factories: What the processes build the run with, importable there; the real parts by default.
-        beside: Of the run inside.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -69,7 +69,10 @@ def execute(folder: ResultsFolder, factories: Factories | None = None, beside: R
         RunStopped: Simulator, tracker, policy or cluster broke down as a whole; finished episodes are kept.
     """
     with backend_of(folder.config.flags, folder.config.device) as backend:
-        return run_and_report(folder, beside, lambda one: _played(backend, one, factories))
+        began = time.perf_counter()
+        if not _played(backend, folder, factories):
+            return INTERRUPTED
+        return reported(folder, time.perf_counter() - began)
 
 
 def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | None) -> bool:
@@ -81,7 +84,7 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
         config = pool.opened(job)
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
-        folder.settle(config, journal.records)
+        folder.prepare(config, journal.records)
         folder.sweep()
         ended.callback(_swept, pool, folder)
         try:
@@ -119,7 +122,7 @@ def _play(run: DealtRun) -> None:
 
 
 def _dealt(run: DealtRun) -> bool:
-    """Give a slice to each process that waits for one; False when all is played."""
+    """Give a batch to each process that waits for one; False when all is played."""
     for worker in run.pool.idle():
         if worker.job is not run.job:
             run.pool.prepare(worker, run.job)
@@ -129,7 +132,7 @@ def _dealt(run: DealtRun) -> bool:
 
 
 class DealtRun:
-    """A run whose episodes are dealt out to a pool: its slices, and the journal of what comes back."""
+    """A run whose episodes are dealt out to a pool: its batches, and the journal of what comes back."""
 
     def __init__(
         self,
@@ -141,7 +144,7 @@ class DealtRun:
         shown: Progress,
         besides: Callable[[], int] = lambda: 0,
     ):
-        """Take what is to be played of a run whose folder was settled.
+        """Take what is to be played of a run whose folder was prepared.
 
         Args:
             job: The run.
@@ -159,7 +162,7 @@ class DealtRun:
         """Episodes to play, by group and by how often they were lost."""
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
-        self._batch = max(1, min(self.config.flags.worlds, self._fair()))
+        self._worlds = max(1, min(self.config.flags.worlds, self._fair()))
         """Worlds of environments."""
         self._losses: Counter[int] = Counter()
         """Losses of each episode while it was played alone."""
@@ -171,13 +174,13 @@ class DealtRun:
         return sum(map(len, self._queues.values()))
 
     @property
-    def slices(self) -> int:
-        """Slices that what nobody plays would make, at least."""
-        return ceil(self.waiting / self._batch)
+    def batches(self) -> int:
+        """Fewest batches that the waiting episodes make."""
+        return ceil(self.waiting / self._worlds)
 
     @property
     def assigned(self) -> bool:
-        """True if a process plays a slice."""
+        """True if a process plays a batch."""
         return any(one.assignment is not None and one.assignment.job is self.job for one in self.pool.workers)
 
     @property
@@ -190,7 +193,7 @@ class DealtRun:
         return ceil((self.waiting + self._besides()) / len(self.pool.workers))
 
     def next(self, worker: Worker) -> Assignment | None:
-        """The next slice for a process: of its environment if possible, else of the group that has the most to do."""
+        """The next batch for a process: of its environment if possible, else of the group that has the most to do."""
         taken = Counter(one.assignment.group for one in self.pool.workers if one.assignment is not None)
         work = {
             key: (key == (worker.last, 0), sum(e.max_steps for e in queue) / (1 + taken[key[0]]))
@@ -201,13 +204,13 @@ class DealtRun:
             return None
         group, level = key = max(work, key=lambda one: work[one])
         queue, worlds = self._queues[key], self.config.flags.worlds
-        size = min(BATCHES * worlds, max(self._batch, self._fair())) if not level else max(1, worlds // SMALLER)
+        size = min(LARGEST * worlds, max(self._worlds, self._fair())) if not level else max(1, worlds // SMALLER)
         size = 1 if level == ALONE else min(size, len(queue))
         episodes = [queue.popleft() for _ in range(size)]
-        return Assignment(self.job, group, {e.index: e for e in episodes}, self._batch if not level else size, level)
+        return Assignment(self.job, group, {e.index: e for e in episodes}, self._worlds if not level else size, level)
 
     def take(self, assignment: Assignment, message: Event | Done | Lost | ArenaError) -> None:
-        """Take what a process tells of its slice.
+        """Take a message of a process about its batch.
 
         Raises:
             ArenaError: The run cannot go on.
@@ -221,7 +224,7 @@ class DealtRun:
             self._keep(assignment, EpisodeRecord.from_json(f"a process of {self.pool.backend.flag}", message.line))
         elif isinstance(message, Lost):
             self._again(assignment, message)
-        elif isinstance(message, Done) and assignment.left:  # told of as ended without a line: no process does that
+        elif isinstance(message, Done) and assignment.left:  # reported as ended without a line: no process does that
             self._again(assignment, Lost("episodes were left out"))
         elif isinstance(message, ArenaError):
             raise message
@@ -255,7 +258,7 @@ class DealtRun:
         self.shown.more([episode.max_steps for episode in more])
 
     def _again(self, assignment: Assignment, lost: Lost) -> None:
-        """Deal out again what a lost process had not finished; who was running then comes into a smaller slice."""
+        """Deal out again what a lost process had not finished; episodes that were running come into a smaller batch."""
         if lost.trace:
             with contextlib.suppress(ArenaError):
                 write_atomic(self.folder.path / BREAK_FILE, lost.trace)

@@ -18,12 +18,15 @@ from typing import cast
 
 from arena_newton.eval.workers.actor import EpisodeActor
 from arena_newton.eval.workers.backend import Process, WorkerLost
-from arena_newton.eval.workers.slice_events import Done, Event, Node, Opened
-from arena_newton.files.own_processes import environment
+from arena_newton.eval.workers.messages import Done, Event, Node, Opened
+from arena_newton.files.own_processes import environment, start_module
 from arena_newton.files.text import counted
 from arena_newton.physics.devices import visible_gpus
 
 __all__ = ["LocalBackend", "LocalProcess"]
+
+PROGRAM = "arena_newton.eval.workers.local_backend"
+"""Module that each process runs."""
 
 
 class LocalProcess:
@@ -38,15 +41,9 @@ class LocalProcess:
         self.gpu, self.runs = gpu, True
         self.pipe, other = connection.Pipe()
         with other:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "arena_newton.eval.workers.local_backend", str(other.fileno())],
-                env=environment() | {"CUDA_VISIBLE_DEVICES": gpu},
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                pass_fds=[other.fileno()],
-                start_new_session=True,
-            )
+            variables = environment() | {"CUDA_VISIBLE_DEVICES": gpu}
+            end = other.fileno()
+            self._process = start_module(PROGRAM, end, files=[end], variables=variables, errors=subprocess.DEVNULL)
 
     def ask(self, method: str, *arguments: object) -> None:
         """Call a method; of a process that has ended `take` tells."""

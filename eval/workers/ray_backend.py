@@ -25,7 +25,7 @@ from arena_newton.eval.plan.options import Ray
 from arena_newton.eval.play.run_flow import RunStopped
 from arena_newton.eval.workers.actor import EpisodeActor
 from arena_newton.eval.workers.backend import Process, WorkerLost
-from arena_newton.eval.workers.slice_events import Done, Event, Node, Opened
+from arena_newton.eval.workers.messages import Done, Event, Node, Opened
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:

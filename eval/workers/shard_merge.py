@@ -21,10 +21,10 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
-from arena_newton.eval.records.schema import Json, JsonObject, shown
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
+from arena_newton.files.stored_json import Json, JsonObject, shown
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["MergedRun", "merge"]
@@ -93,10 +93,10 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
         some = f"{counted(planned - len(kept), 'episode')} of {planned:,}"
         if runs[0].config.get("keep") is not None:
             some = f"successes of at most {counted(planned, 'episode')}"
-        said = f"{some} missing: {_missing(runs, kept)}"
+        text = f"{some} missing: {_missing(runs, kept)}"
         if not partial:
-            raise InputError(f"merge: {said}; finish them, or join what there is with --partial")
-        notes.append(f"Joined with {said}.")
+            raise InputError(f"merge: {text}; finish them, or join what there is with --partial")
+        notes.append(f"Joined with {text}.")
     document = _document(runs, out, whole=whole)
     temporary = Path(os.path.abspath(out) + PARTIAL)
     if temporary.exists() or temporary.is_symlink():
@@ -172,7 +172,7 @@ def _check_alike(first: RunRecord, other: RunRecord, accept_versions: bool) -> N
 
 
 def _check_environments(runs: Sequence[RunRecord]) -> None:
-    """Refuse folders whose environments said something else of themselves; a shard may lack some of them."""
+    """Refuse folders whose environments describe themselves otherwise; a shard may lack some of them."""
     known: dict[str, tuple[JsonObject, Path]] = {}
     for run in runs:
         for group, facts in run.document.get("environments", {}).items():
@@ -283,7 +283,7 @@ def _document(runs: Sequence[RunRecord], out: Path, *, whole: bool) -> Document:
     """config.json of all: the first folder's, with the environments and versions of the others."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
-    document["options"] = runs[0].document["options"] | {"shard": None, "seeing": False, "out": str(out)}
+    document["options"] = runs[0].document["options"] | {"shard": None, "out": str(out)}
     environments: dict[str, JsonObject] = {}
     for run in runs:
         environments = run.document.get("environments", {}) | environments

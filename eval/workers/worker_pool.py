@@ -22,7 +22,7 @@ from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.backend import PoolBackend, Process, WorkerLost
-from arena_newton.eval.workers.slice_events import Broke, Done, Event, Node, Opened, Slice
+from arena_newton.eval.workers.messages import Broke, Done, EpisodeBatch, Event, Node, Opened
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Assignment", "Job", "Lost", "Worker", "WorkerPool", "backend_of"]
 
 BEGINNING = 600.0
-"""A process has at least this time to build tracker and policy, whatever a slice has [s]."""
+"""A process has at least this time to build tracker and policy, whatever a batch has [s]."""
 STARTS = 5
 """A process that was lost so often before it built an environment stops the run."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 30.0
@@ -47,7 +47,7 @@ PATIENCE = 30.0
 
 @dataclass(eq=False)
 class Job:
-    """A run that processes open, to play slices of it."""
+    """A run that processes open, to play batches of it."""
 
     folder: ResultsFolder
     opened: Opened | None = None
@@ -69,7 +69,7 @@ class Job:
 
 @dataclass
 class Assignment:
-    """A slice of a run that a process plays."""
+    """A batch of a run that a process plays."""
 
     job: Job
     group: Group
@@ -94,7 +94,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class Lost:
-    """The process of a slice was lost, or broke."""
+    """The process of a batch was lost, or broke."""
 
     cause: str
     trace: str = ""
@@ -200,10 +200,10 @@ class WorkerPool:
         worker.process.ask("open", job.options(), path, self.backend.cores(worker.rank), self._factories)
 
     def assign(self, worker: Worker, assignment: Assignment) -> None:
-        """Let a process that waits play a slice of the run that it has opened."""
+        """Let a process that waits play a batch of the run that it has opened."""
         assert worker.process is not None and worker.job is assignment.job
         config_hash = assignment.job.folder.document["config_hash"]
-        part = Slice(" ".join(assignment.group), tuple(assignment.left), assignment.worlds, config_hash)
+        part = EpisodeBatch(" ".join(assignment.group), tuple(assignment.left), assignment.worlds, config_hash)
         worker.assignment, worker.last, worker.busy = assignment, assignment.group, True
         worker.since, worker.until = time.monotonic(), self._late()
         worker.process.ask("play", part)
@@ -212,7 +212,7 @@ class WorkerPool:
         """Messages of the processes; waits a little for them. Lost processes are replaced.
 
         Yields:
-            The run, the slice of it where one is played, and its message: an error where another process could not
+            The run, the batch of it where one is played, and its message: an error where another process could not
             go on with the run either.
 
         Raises:

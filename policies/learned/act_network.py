@@ -39,7 +39,7 @@ class ActSizes:
     state: int
     """Numbers of the state."""
     tasks: int
-    """Width of the task vector; 0: none."""
+    """Width of the vector of task and tracker; 0: none."""
     actions: int
     """Numbers of an action."""
     chunk_size: int
@@ -174,14 +174,14 @@ class AttentionLayer(nn.Module):
             asked = x + position
             return self.self_attn(asked, asked, x, need_weights=False)[0]
 
-        def look(x: torch.Tensor) -> torch.Tensor:
+        def cross(x: torch.Tensor) -> torch.Tensor:
             assert seen is not None and seen_position is not None
             return self.multihead_attn(x + position, seen + seen_position, seen, need_weights=False)[0]
 
         def think(x: torch.Tensor) -> torch.Tensor:
             return self.linear2(self.activation(self.linear1(x)))
 
-        steps = [(attend, self.norm1), *([(look, self.norm2)] if self.crossed else [])]
+        steps = [(attend, self.norm1), *([(cross, self.norm2)] if self.crossed else [])]
         steps.append((think, self.norm3 if self.crossed else self.norm2))
         for work, norm in steps:
             x = x + work(norm(x)) if self.pre_norm else norm(x + work(x))
@@ -248,7 +248,7 @@ class ActNetwork(nn.Module):
         self.backbone.fold()
 
     def forward(self, picture: torch.Tensor, state: torch.Tensor, task: torch.Tensor | None) -> torch.Tensor:
-        """Actions of a look.
+        """Actions of a query.
 
         Args:
             picture: Shape [B, 3, H, W].

@@ -38,9 +38,9 @@ def check_facts(card: PolicyCard, checkpoint: ActCheckpoint) -> None:
     if stray:
         raise InputError(f"{path}: tasks names {stray[0]}, which its task vector lacks")
     for name, value in training_entries(facts).items():
-        said = getattr(card, name)
-        if said != value:
-            raise InputError(f"{path}: {name} is {said!r:.80}, but {FACTS_FILE} has {value!r:.80}; {REMEDY}")
+        declared = getattr(card, name)
+        if declared != value:
+            raise InputError(f"{path}: {name} is {declared!r:.80}, but {FACTS_FILE} has {value!r:.80}; {REMEDY}")
 
 
 def check_weights(card: PolicyCard, checkpoint: ActCheckpoint) -> None:

@@ -6,10 +6,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
-from arena_newton.files.untrusted_files import read_bytes
+from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.pages.tables import Table, between, percent
 from arena_newton.tasks.semantic_mode import semantic_notes
 
@@ -32,6 +33,13 @@ MOST_CARD = 1 << 20
 """Largest card that is read [bytes]."""
 MOST_EPISODES = 10_000_000
 """Most episodes of a cell; more is a damaged file."""
+CELL = "task, tracker, mode, episodes, successes and falls"
+
+
+def _possible(cell: Mapping[str, int]) -> bool:
+    """True if the counts of a cell can be."""
+    successes, falls, episodes = cell["successes"], cell["falls"], cell["episodes"]
+    return 0 < episodes <= MOST_EPISODES and min(successes, falls) >= 0 and successes + falls <= episodes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +59,7 @@ class CellResult:
         Raises:
             InputError: More successes or falls than episodes, or no episode.
         """
-        fits = 0 < self.episodes <= MOST_EPISODES and min(self.successes, self.falls) >= 0
-        if not fits or self.successes + self.falls > self.episodes:
+        if not _possible(vars(self)):
             counts = f"{self.successes} successes and {self.falls} falls of {self.episodes} episodes"
             raise InputError(f"{self.task} {self.tracker} {self.mode}: {counts}, which cannot be")
 
@@ -62,13 +69,16 @@ class CellResult:
         return self.successes / self.episodes
 
 
+Results = Annotated[tuple[CellResult, ...], Fit(f"cells with {CELL}", lambda cells: all(map(_possible, cells)))]
+
+
 @dataclass(frozen=True, kw_only=True)
 class PolicyCard:
     """Card of a packed policy, which describes it."""
 
-    tasks: tuple[str, ...]
+    tasks: Annotated[tuple[str, ...], Fit("at least one name", lambda names: bool(names) and all(names))]
     """Tasks that it is offered for; the default run shows the first."""
-    trackers: tuple[str, ...] = ()
+    trackers: Annotated[tuple[str, ...], Fit("names", all)] = ()
     """Trackers through which its demonstrations were recorded."""
     family: str = ""
     recipe: str = ""
@@ -79,7 +89,7 @@ class PolicyCard:
     """Time of the training [min]."""
     device: str = ""
     """Device of the training."""
-    datasets: tuple[Mapping[str, object], ...] = ()
+    datasets: Annotated[tuple[Mapping[str, object], ...], Fit("a list of objects")] = ()
     """Of each dataset of its training: name, hash, episodes, frames."""
     command: str = ""
     """Command of the training."""
@@ -92,7 +102,7 @@ class PolicyCard:
     bytes: int = 0
     """Size of all files but the card [bytes]."""
     note: str = ""
-    results: tuple[CellResult, ...] = ()
+    results: Results = ()
 
     def check_tasks(self, asked: Sequence[str]) -> None:
         """Refuse tasks that it is not offered for.
@@ -156,49 +166,7 @@ def read_card(folder: Path) -> PolicyCard:
     path = folder / CARD_FILE
     if not path.is_file():
         raise InputError(f"{folder}: holds no packed policy (no {CARD_FILE})")
-    try:
-        content = json.loads(read_bytes(path, MOST_CARD))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
-        raise InputError(f"{path}: expected an object with format {FORMAT}")
-    given = {name: content[name] for name in PolicyCard.__dataclass_fields__ if name in content}
-    kinds: dict[str, type | tuple[type, ...]] = {"steps": int, "seed": int, "bytes": int, "gpu_minutes": (int, float)}
-    for name, value in given.items():
-        if name in ("tasks", "trackers"):
-            given[name] = _names(path, name, value)
-        elif name == "datasets":
-            given[name] = tuple(_objects(path, name, value))
-        elif name == "results":
-            given[name] = tuple(_cell_result(path, i, one) for i, one in enumerate(_objects(path, name, value)))
-        elif isinstance(value, bool) or not isinstance(value, kinds.get(name, str)):
-            raise InputError(f"{path}: {name} is {str(value)[:80]!r}, which it cannot be")
-    if not given.get("tasks"):
-        raise InputError(f"{path}: tasks is empty, expected at least one")
-    return PolicyCard(**given)
-
-
-def _names(path: Path, name: str, value: object) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(one, str) and one for one in value):
-        raise InputError(f"{path}: {name} is {str(value)[:80]!r}, expected a list of names")
-    return tuple(value)
-
-
-def _objects(path: Path, name: str, value: object) -> Sequence[dict[str, object]]:
-    if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
-        raise InputError(f"{path}: {name} is {str(value)[:80]!r}, expected a list of objects")
-    return value
-
-
-def _cell_result(path: Path, index: int, given: Mapping[str, object]) -> CellResult:
-    names, counts = ("task", "tracker", "mode"), ("episodes", "successes", "falls")
-    words, numbers = [given.get(name) for name in names], [given.get(name) for name in counts]
-    if not all(isinstance(one, str) for one in words) or not all(type(one) is int for one in numbers):
-        raise InputError(f"{path}: results[{index}] is {str(given)[:120]!r}, expected {', '.join(names + counts)}")
-    try:
-        return CellResult(**{name: given[name] for name in names + counts})  # type: ignore[arg-type]  # checked above
-    except InputError as error:
-        raise InputError(f"{path}: results[{index}]: {error}") from None
+    return loaded(str(path), read_object(path, MOST_CARD, FORMAT), PolicyCard)
 
 
 def shipped_card() -> PolicyCard | None:

@@ -28,7 +28,7 @@ CPU_ROWS = 1
 
 
 class LearnedPolicy(Policy):
-    """Runs a packed ACT: looks once a chunk, executes it open loop, draws no random numbers and remembers nothing."""
+    """Runs a packed ACT: one query per chunk, executed open loop, draws no random numbers and remembers nothing."""
 
     name = "learned"
     needs_image = True
@@ -77,7 +77,7 @@ class LearnedPolicy(Policy):
         state = observation.state
         worlds, device = len(state), self._device or state.device
         network = self._on(device)
-        if device.type == "cpu":  # not in `check`, which does not know where the looks will be
+        if device.type == "cpu":  # not in `check`, which does not know where the queries will be
             network.on_host(self.checkpoint.facts.height, self.checkpoint.facts.width)
         pictures = self._pictures(observation)
         asking = np.flatnonzero(world_mask(observation.mask, worlds)).tolist()
@@ -87,11 +87,11 @@ class LearnedPolicy(Policy):
         # Who does not ask stands, in v3.1, of which orientations must name a rotation.
         filler = torch.from_numpy(STAND_ACTION) if self.labels == "v3.1" else torch.zeros(ACTION_WIDTH)
         actions = filler.to(state.device).repeat(worlds, self.chunk_size, 1)
-        vector = self._task_vector(observation.task, device)
+        vector = self._vector(observation, device)
         size = CPU_ROWS if device.type == "cpu" else CUDA_ROWS
 
         @torch.inference_mode()
-        def look(some: list[int]) -> torch.Tensor:
+        def query(some: list[int]) -> torch.Tensor:
             """Chunks of some worlds, filled up to the size of a forward pass."""
             filled = [*some, *([some[0]] * (size - len(some)))]
             seen = pictures[filled].to(device).permute(0, 3, 1, 2).float() / 255.0
@@ -103,8 +103,8 @@ class LearnedPolicy(Policy):
             return chunk[: len(some), : self.chunk_size]
 
         parts = [serving[first : first + size] for first in range(0, len(serving), size)]
-        with _looking(device, len(parts)) as each:
-            for some, chunk in zip(parts, each(look, parts), strict=True):
+        with _querying(device, len(parts)) as each:
+            for some, chunk in zip(parts, each(query, parts), strict=True):
                 actions[some] = chunk.to(state.device)
         usable = torch.isfinite(actions[serving]).all(dim=2).all(dim=1).tolist()
         errors |= {w: "the network's answer is not finite" for w, ok in zip(serving, usable, strict=True) if not ok}
@@ -127,6 +127,7 @@ class LearnedPolicy(Policy):
             "labels": facts.labels,
             "realign": facts.realign,
             "task_vector": list(facts.task_vector),
+            **({"tracker_vector": list(facts.tracker_vector)} if facts.tracker_vector else {}),
             "picture": [facts.width, facts.height, facts.fit],
             "predicted": self.checkpoint.sizes.chunk_size,
             "replan": self.chunk_size,
@@ -161,21 +162,21 @@ class LearnedPolicy(Policy):
             raise InputError(f"policy {self.name}: expected pictures of {list(size)}, was given {given}")
         return pictures
 
-    def _task_vector(self, task: str, device: torch.device) -> torch.Tensor | None:
-        """The one-hot vector of the task; None for policies without one."""
-        self.check_task(task)
-        known = self.checkpoint.facts.task_vector
-        return torch.tensor([float(name == task) for name in known], device=device) if known else None
+    def _vector(self, seen: Observation, device: torch.device) -> torch.Tensor | None:
+        """The one-hot vector of task and tracker; None for policies without one."""
+        self.check_task(seen.task)
+        numbers = self.checkpoint.facts.vector(seen.task, seen.tracker)
+        return torch.tensor(numbers, device=device) if numbers else None
 
 
-Looks = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterable[torch.Tensor]]
+Queries = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterable[torch.Tensor]]
 
 
 @contextlib.contextmanager
-def _looking(device: torch.device, count: int) -> Iterator[Looks]:
+def _querying(device: torch.device, count: int) -> Iterator[Queries]:
     """Runs queries: on the CPU each on one core, as many at once as torch may have threads.
 
-    A look is too small for two cores: where the machine is busy they lose more by waiting for each other. And an
+    A query is too small for two cores: where the machine is busy they lose more by waiting for each other. And an
     answer then has the same bits on machines with another number of cores.
     """
     threads = torch.get_num_threads()

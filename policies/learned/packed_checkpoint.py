@@ -1,12 +1,11 @@
 """A checkpoint of ACT as files, read without LeRobot: sizes, statistics and weights, all checked.
 
 What is read is what LeRobot writes (`config.json`, the processors' files, `model.safetensors`), JSON and safetensors
-only. Whatever a look would be computed differently by is refused, so that a packed policy answers as LeRobot does.
+only. Whatever a query would be computed differently by is refused, so that a packed policy answers as LeRobot does.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,7 +14,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from arena_newton.errors import InputError
-from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
+from arena_newton.files.stored_json import read_object
+from arena_newton.files.untrusted_files import check_size, file_digest
 from arena_newton.policies.learned.act_network import ACTIVATIONS, BLOCKS, ActNetwork, ActSizes
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, NORMALISES, CheckpointFacts
 from arena_newton.policies.lerobot.checkpoint_tensors import check_spread
@@ -44,7 +44,7 @@ STEPS = {
     ),
     "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
 }
-"""Steps of ACT's processors in LeRobot 0.6; others would change a look."""
+"""Steps of ACT's processors in LeRobot 0.6; others would change a query."""
 FRONT, STATE, TASK_VECTOR = "observation.images.front", "observation.state", "observation.environment_state"
 """Keys of the observations."""
 KINDS = {FRONT: "VISUAL", STATE: "STATE", TASK_VECTOR: "ENV", "action": "ACTION"}
@@ -85,7 +85,7 @@ class ActCheckpoint:
     folder: Path
     sizes: ActSizes
     executed: int
-    """Actions of an answer that are executed before the next look."""
+    """Actions of an answer that are executed before the next query."""
     facts: CheckpointFacts
     spreads: Mapping[str, Spread]
     """Feature → how it is normalised; a feature that is not here goes in, or comes out, as it is."""
@@ -128,8 +128,8 @@ def loaded_network(path: Path, sizes: ActSizes, weights: dict[str, torch.Tensor]
         network = ActNetwork(sizes)
         network.load(weights)
     except (KeyError, RuntimeError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: does not hold the weights of this network: {said}") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: does not hold the weights of this network: {text}") from None
     return network
 
 
@@ -144,8 +144,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         with safe_open(path, framework="pt") as file:
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: not readable as safetensors ({said})") from None
+        text = " ".join(str(error).split())[:300]
+        raise InputError(f"{path}: not readable as safetensors ({text})") from None
     for name, value in found.items():
         if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
             raise InputError(f"{path}: {name} holds something else than finite floating-point numbers")
@@ -159,10 +159,10 @@ def read_act_checkpoint(folder: Path) -> ActCheckpoint:
         InputError: It is no ACT of our observations and actions, or a file is damaged; the message names file and
             field.
     """
-    config = _json(folder / CONFIG_FILE)
+    config = read_object(folder / CONFIG_FILE, MOST_JSON)
     kind = config.get("type")
     if kind != "act":
-        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}; only act is packed, whose looks are cheap")
+        raise InputError(f"{folder / CONFIG_FILE}: type is {kind!r:.60}; only act is packed, whose queries are cheap")
     facts = CheckpointFacts.read(folder)
     if facts is None:
         raise InputError(f"{folder}: holds no {FACTS_FILE}, which says how its actions are read")
@@ -172,14 +172,6 @@ def read_act_checkpoint(folder: Path) -> ActCheckpoint:
     digest = file_digest(folder / WEIGHTS_NAME, MOST_WEIGHTS)
     names = (WEIGHTS_NAME, CONFIG_FILE, FACTS_FILE, *PROCESSOR_FILES, *files)
     return ActCheckpoint(folder, sizes, executed, facts, spreads, digest, names, config.get("use_vae") is True)
-
-
-def _json(path: Path) -> dict[str, object]:
-    try:
-        content = json.loads(read_bytes(path, MOST_JSON))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    return _object(path, "the file", content)
 
 
 def _object(path: Path, where: str, value: object) -> dict[str, object]:
@@ -199,7 +191,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     """Sizes of the network; whatever it would need besides is refused."""
     expected: dict[str, list[int]] = {FRONT: [3, facts.height, facts.width], STATE: [STATE_WIDTH]}
     if facts.task_vector:
-        expected[TASK_VECTOR] = [len(facts.task_vector)]
+        expected[TASK_VECTOR] = [facts.vector_width]
     for field, wanted in (("input_features", expected), ("output_features", {"action": [ACTION_WIDTH]})):
         given = _object(path, field, config.get(field))
         shapes = {name: _object(path, f"{field}.{name}", one).get("shape") for name, one in given.items()}
@@ -225,7 +217,7 @@ def _sizes(path: Path, config: Mapping[str, object], facts: CheckpointFacts) -> 
     if numbers["dim_model"] % numbers["n_heads"] or numbers["dim_model"] % 4:
         raise InputError(f"{path}: dim_model is {numbers['dim_model']}, expected a multiple of n_heads and of 4")
     words = {one.name: config[one.name] for one in fields(ActSizes) if one.name in refused}
-    return ActSizes(state=STATE_WIDTH, tasks=len(facts.task_vector), actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
+    return ActSizes(state=STATE_WIDTH, tasks=facts.vector_width, actions=ACTION_WIDTH, **numbers, **words)  # type: ignore[arg-type]  # checked above
 
 
 def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str]]:
@@ -234,7 +226,7 @@ def _spreads(folder: Path, sizes: ActSizes) -> tuple[dict[str, Spread], list[str
     files = []
     for name in PROCESSOR_FILES:
         path = folder / name
-        steps = _json(path).get("steps")
+        steps = read_object(path, MOST_JSON).get("steps")
         registered = [one.get("registry_name") if isinstance(one, dict) else None for one in _list(path, steps)]
         if tuple(registered) != STEPS[name]:
             raise InputError(f"{path}: steps are {str(registered)[:200]}, expected {', '.join(STEPS[name])}")

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated, Literal
 
 from arena_newton.data.readers.label_protocols import protocol
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.files.text import plain_text
 from arena_newton.pictures.settings import CameraConfig
 
-__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder"]
+__all__ = ["CONFIG_FILE", "FACTS_FILE", "NORMALISES", "CheckpointFacts", "checkpoint_folder", "vector_of"]
 
 FACTS_FILE = "arena_policy.json"
 """File of a checkpoint that holds its `CheckpointFacts`."""
@@ -28,6 +30,8 @@ NORMALISES = ("normalizer_processor", "unnormalizer_processor")
 """Steps of LeRobot's processors with statistics."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 """Name of a task or tracker."""
+MOST_BYTES = 16 << 20
+"""Largest file that is read."""
 FORMAT = 1
 """Version of the file."""
 INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model", "last/pretrained_model")
@@ -40,17 +44,20 @@ class CheckpointFacts:
 
     labels: str = "v3.1"
     """Protocol of its actions (`data.readers.label_protocols`)."""
-    realign: float = 0.0
+    realign: Annotated[float, Fit("0 to 1", lambda value: 0.0 <= value <= 1.0)] = 0.0
     """Fraction of the gap between the commanded and the measured heading that is closed each tick; of v4 only."""
     width: int = 224
     """Width of the head camera's picture [px]."""
     height: int = 224
     """Height of the head camera's picture [px]."""
-    fit: str = "pad"
+    fit: Literal["pad", "native"] = "pad"
     """`pad` or `native`, as in `CameraConfig`."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given as `observation.environment_state`; none: it
     is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow those of the tasks, and one more for any other tracker; none:
+    the vector says nothing of the tracker."""
     family: str = ""
     """`act`, `diffusion`, `flow`, `pi05`."""
     recipe: str = ""
@@ -62,7 +69,7 @@ class CheckpointFacts:
     steps: int = 0
     """Optimizer steps."""
     seed: int = 0
-    minutes: float = 0.0
+    minutes: Annotated[float, Fit("a time", lambda value: abs(value) < 1e12)] = 0.0
     """Time of the training [min]."""
     device: str = ""
     """Device of the training, such as `NVIDIA H200`."""
@@ -72,9 +79,18 @@ class CheckpointFacts:
     """The training's resolved options."""
 
     @property
+    def vector_width(self) -> int:
+        """Numbers of the vector of task and tracker; 0: the policy is given none."""
+        return len(self.vector("", ""))
+
+    def vector(self, task: str, tracker: str) -> list[float]:
+        """The vector of a task and a tracker."""
+        return vector_of(self.task_vector, self.tracker_vector, task, tracker)
+
+    @property
     def camera(self) -> CameraConfig:
         """The picture that the policy wants."""
-        return CameraConfig(width=self.width, height=self.height, fit="native" if self.fit == "native" else "pad")
+        return CameraConfig(width=self.width, height=self.height, fit=self.fit)
 
     def write(self, folder: Path) -> None:
         """Write the file of a checkpoint."""
@@ -92,27 +108,15 @@ class CheckpointFacts:
         path = folder / FACTS_FILE
         if not path.is_file():
             return None
-        try:
-            content = json.loads(path.read_bytes())
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{path}: not readable as JSON ({error})") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise InputError(f"{path}: expected an object with format {FORMAT}")
-        values: dict[str, object] = {}
-        for one in fields(cls):
-            if one.name in content:
-                values[one.name] = _checked(path, one.name, one.default, content[one.name])
-        facts = cls(**values)  # type: ignore[arg-type]  # each is of its default's kind
-        if len(set(facts.task_vector)) < len(facts.task_vector):
-            raise InputError(f"{path}: task_vector names a task twice")
-        for key in ("task_vector", "tasks", "trackers"):
+        facts = loaded(str(path), read_object(path, MOST_BYTES, FORMAT), cls)
+        if facts.tracker_vector and not facts.task_vector:
+            raise InputError(f"{path}: tracker_vector is given without a task_vector, which it is a part of")
+        for key in ("task_vector", "tracker_vector", "tasks", "trackers"):
+            if key.endswith("vector") and len(set(getattr(facts, key))) < len(getattr(facts, key)):
+                raise InputError(f"{path}: {key} names a {key.removesuffix('_vector')} twice")
             for name in getattr(facts, key):
                 if not _NAME.fullmatch(name):
                     raise InputError(f"{path}: {key} holds {plain_text(name, 60)!r}, which is no name")
-        if facts.fit not in ("pad", "native"):
-            raise InputError(f"{path}: fit is {facts.fit!r}, expected pad or native")
-        if not 0.0 <= facts.realign <= 1.0:
-            raise InputError(f"{path}: realign is {facts.realign}, expected 0 to 1")
         if not all(16 <= n <= 4096 for n in (facts.width, facts.height)):
             raise InputError(f"{path}: a picture of {facts.width}x{facts.height} pixels, expected 16 to 4096 each")
         try:
@@ -122,24 +126,19 @@ class CheckpointFacts:
         return facts
 
 
-def _checked(path: Path, name: str, default: object, value: object) -> object:
-    """A value of the file, of the kind that the record's default is."""
-    match value:
-        case list() if name == "datasets" and all(isinstance(one, dict) for one in value):
-            return tuple(value)
-        case list() if name != "datasets" and default == () and all(isinstance(one, str) for one in value):
-            return tuple(value)
-        case dict() if name == "options":
-            return value
-        case bool():
-            pass
-        case str() if isinstance(default, str):
-            return value
-        case int() if isinstance(default, int):
-            return value
-        case int() | float() if isinstance(default, float) and abs(value) < 1e12:
-            return float(value)
-    raise InputError(f"{path}: {name} is {str(value)[:80]!r}, which it cannot be")
+def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker: str) -> list[float]:
+    """One-hot numbers of a task, then, where trackers are named, of a tracker.
+
+    Args:
+        tasks: In the order of their numbers.
+        trackers: In the order of their numbers, after which one more is that of any other tracker.
+        task: Name.
+        tracker: Name; empty: not known.
+    """
+    told = [float(name == task) for name in tasks]
+    if trackers:
+        told += [float(name == tracker) for name in trackers] + [float(tracker not in trackers)]
+    return told
 
 
 def checkpoint_folder(path: Path, flag: str = "--policy lerobot") -> Path:

@@ -66,11 +66,11 @@ class PolicyNetwork:
         except Exception as error:  # a step computes with what its files say
             where = f"{self.checkpoint.folder}: its processors or their statistics do not fit its observations"
             raise InputError(f"{where}: {_first(error)}") from None
-        # Only these read the state of a look, whose shape they expect in every action.
+        # Only these read the state of a query, whose shape they expect in every action.
         self._per_tick = any(isinstance(one, AbsoluteActionsProcessorStep) and one.enabled for one in self.after.steps)
 
     def _rehearse(self) -> None:
-        """Pass an empty look and an empty action through the processors."""
+        """Pass an empty query and an empty action through the processors."""
         config = self.checkpoint.config
         ticks = (self.checkpoint.observations,) if self.checkpoint.observations > 1 else ()
         seen = {
@@ -83,7 +83,7 @@ class PolicyNetwork:
             self.after(torch.zeros(1, config.action_feature.shape[0], device=self.device))
 
     def predict(self, seen: Mapping[str, torch.Tensor], instruction: str, draws: Sequence[Draw]) -> torch.Tensor:
-        """Actions of a look.
+        """Actions of a query.
 
         Args:
             seen: Observations by their names in datasets, float32 on the device, shape [rows, ...], or for policies

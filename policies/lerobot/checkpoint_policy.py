@@ -27,7 +27,7 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 __all__ = ["ENSEMBLE_TICKS", "LeRobotPolicy", "from_spec"]
 
 ENSEMBLE_TICKS = 1
-"""Ticks between two looks where chunks are averaged and no number is given, as LeRobot's ensembling has it."""
+"""Ticks between two queries where chunks are averaged and no number is given, as LeRobot's ensembling has it."""
 CUDA_ROWS = {"act": 64, "diffusion": 64, "flow": 64, "pi05": 8}
 """Family → rows of every forward pass on a GPU: one size always, so that no kernels are chosen again and a row's
 answer does not depend on how many others ask. 64 holds the 60 episodes of a cell; pi0.5 costs what its rows cost."""
@@ -57,7 +57,7 @@ class LeRobotPolicy(Policy):
 
         Args:
             folder: A checkpoint, or the folder of a training, whose last one is taken.
-            replan: Actions of an answer that are executed before the next look; as many as the checkpoint says by
+            replan: Actions of an answer that are executed before the next query; as many as the checkpoint says by
                 default, 1 with `ensemble`.
             ensemble: Execute at each tick the mean of all answers that cover it.
             device: Torch device of the network; that of the observations by default.
@@ -79,13 +79,13 @@ class LeRobotPolicy(Policy):
         self.chunk_size = replan
         self.in_pieces = self.checkpoint.observations > 1
         self.ensemble = ensemble
-        self.looked: np.ndarray | None = None
-        """Worlds whose last answer began with a look of the network, bool, shape [worlds]."""
+        self.queried: np.ndarray | None = None
+        """Worlds whose last answer began with a query of the network, bool, shape [worlds]."""
         self._device = None if device is None else torch.device(device)
         self._network: PolicyNetwork | None = None
         self._memory: ChunkMemory | None = None
         self._seeds: list[int] = []
-        self._looks: list[int] = []
+        self._queries: list[int] = []
 
     def check(self) -> None:
         """Load the weights.
@@ -107,9 +107,9 @@ class LeRobotPolicy(Policy):
         """Begin new episodes; forgets everything where the number of worlds is another one than before."""
         worlds = len(seeds)
         if len(self._seeds) != worlds:
-            self._seeds, self._looks, self._memory = [0] * worlds, [0] * worlds, None
+            self._seeds, self._queries, self._memory = [0] * worlds, [0] * worlds, None
         for world in np.flatnonzero(world_mask(mask, worlds)).tolist():
-            self._seeds[world], self._looks[world] = int(seeds[world]), 0
+            self._seeds[world], self._queries[world] = int(seeds[world]), 0
             if self._memory is not None:
                 self._memory.reset(world)
 
@@ -128,16 +128,16 @@ class LeRobotPolicy(Policy):
         errors = {w: "its state is not finite" for w, ok in zip(asking, finite, strict=True) if not ok}
         serving = [world for world in asking if world not in errors]
         self._glimpse(observation, serving, device, memory)
-        looking = [world for world in serving if not memory.waits(world)]
+        querying = [world for world in serving if not memory.waits(world)]
         rows = CPU_ROWS if device.type == "cpu" else CUDA_ROWS[FAMILY_TYPES[self.checkpoint.type]]
-        vector = self._task_vector(observation.task, device)
-        for first in range(0, len(looking), rows):
-            some = looking[first : first + rows]
+        vector = self._vector(observation, device)
+        for first in range(0, len(querying), rows):
+            some = querying[first : first + rows]
             chunks = self._predict(network, memory, some, rows, vector, observation.instruction)
             memory.answer(some, chunks)
             for world in some:
-                self._looks[world] += 1
-        self.looked = np.isin(np.arange(worlds), looking)
+                self._queries[world] += 1
+        self.queried = np.isin(np.arange(worlds), querying)
         if not serving:
             return Chunk(self._filler(worlds, 1, state.device), errors)
         given = memory.give(serving)
@@ -166,6 +166,7 @@ class LeRobotPolicy(Policy):
             "labels": facts.labels,
             "realign": facts.realign,
             "task_vector": list(facts.task_vector),
+            **({"tracker_vector": list(facts.tracker_vector)} if facts.tracker_vector else {}),
             "picture": picture,
             "prepared": checkpoint.preparation is not None,
             "observations": checkpoint.observations,
@@ -190,7 +191,7 @@ class LeRobotPolicy(Policy):
 
     def _remembering(self, worlds: int, device: torch.device) -> ChunkMemory:
         if len(self._seeds) != worlds:  # asked without a reset, as a check of the interface may do
-            self._seeds, self._looks, self._memory = [0] * worlds, [0] * worlds, None
+            self._seeds, self._queries, self._memory = [0] * worlds, [0] * worlds, None
         if self._memory is None:
             self._memory = ChunkMemory(
                 worlds,
@@ -226,15 +227,15 @@ class LeRobotPolicy(Policy):
         vector: torch.Tensor | None,
         instruction: str,
     ) -> torch.Tensor:
-        """Answers to a look of at most `rows` worlds; the forward pass has as many rows always."""
+        """Answers to a query of at most `rows` worlds; the forward pass has as many rows always."""
         filled = [*worlds, *([worlds[0]] * (rows - len(worlds)))]
-        looks = [memory.looked_at(world) for world in filled]
+        queries = [memory.queried(world) for world in filled]
         ticks = self.checkpoint.observations
         several = ticks > 1 or self.checkpoint.type in TICKS_TYPES
-        states = [[one[STATE] for one in look] for look in looks]
+        states = [[one[STATE] for one in query] for query in queries]
         seen: dict[str, torch.Tensor] = {STATE: self._stacked(states, several)}
         if self.camera is not None:
-            pictures = self._stacked([[one[FRONT] for one in look] for look in looks], True)
+            pictures = self._stacked([[one[FRONT] for one in query] for query in queries], True)
             flat = pictures.flatten(0, 1)
             if self.checkpoint.preparation is not None:
                 flat = self.checkpoint.preparation(flat)
@@ -244,25 +245,24 @@ class LeRobotPolicy(Policy):
         if vector is not None:
             repeated = vector.expand(rows, ticks, -1)
             seen[TASK_VECTOR] = (repeated if several else repeated[:, 0]).contiguous()
-        draws = [Draw(self._seeds[world], self._looks[world]) for world in filled]
+        draws = [Draw(self._seeds[world], self._queries[world]) for world in filled]
         return network.predict(seen, instruction, draws)[: len(worlds)]
 
     @staticmethod
-    def _stacked(looks: Sequence[Sequence[torch.Tensor]], several: bool) -> torch.Tensor:
+    def _stacked(queries: Sequence[Sequence[torch.Tensor]], several: bool) -> torch.Tensor:
         """Rows [rows, ticks, ...], or [rows, ...] of the one tick."""
-        return torch.stack([torch.stack(list(look)) if several else look[-1] for look in looks])
+        return torch.stack([torch.stack(list(query)) if several else query[-1] for query in queries])
 
-    def _task_vector(self, task: str, device: torch.device) -> torch.Tensor | None:
-        """The one-hot vector of the task; None for policies without one.
+    def _vector(self, seen: Observation, device: torch.device) -> torch.Tensor | None:
+        """The one-hot vector of task and tracker; None for policies without one.
 
         Raises:
             InputError: The policy does not know the task.
         """
-        known = self.checkpoint.facts.task_vector
-        if not known:
+        if not self.checkpoint.facts.task_vector:
             return None
-        self.check_task(task)
-        return torch.tensor([float(name == task) for name in known], device=device)
+        self.check_task(seen.task)
+        return torch.tensor(self.checkpoint.facts.vector(seen.task, seen.tracker), device=device)
 
     def _filler(self, worlds: int, length: int, device: torch.device) -> torch.Tensor:
         """Chunks of worlds that do not ask: standing in v3.1, of which orientations must name a rotation."""

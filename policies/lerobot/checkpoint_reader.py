@@ -21,7 +21,8 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
-from arena_newton.files.untrusted_files import check_size, file_digest, read_bytes
+from arena_newton.files.stored_json import read_object
+from arena_newton.files.untrusted_files import check_size, file_digest
 from arena_newton.pictures.settings import CameraConfig, robot_fit
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
@@ -122,7 +123,7 @@ class PolicyCheckpoint:
 
     @property
     def executed(self) -> int:
-        """Actions of an answer that are executed before the next look."""
+        """Actions of an answer that are executed before the next query."""
         return int(self.config.n_action_steps)
 
 
@@ -149,7 +150,7 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     if not (folder / WEIGHTS).is_file():
         raise InputError(f"{folder}: holds no {WEIGHTS}; weights in other files, such as pickles, are not read")
     check_size(folder / WEIGHTS, MOST_WEIGHTS)
-    content = _json(folder / CONFIG_FILE)
+    content = read_object(folder / CONFIG_FILE, MOST_JSON)
     kind = content.pop("type", None)
     known = PreTrainedConfig.get_known_choices()
     if not isinstance(kind, str) or kind not in known:
@@ -175,16 +176,6 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     check_layers(folder / WEIGHTS, kind, config)
     digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
     return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
-
-
-def _json(path: Path) -> dict[str, object]:
-    try:
-        content = json.loads(read_bytes(path, MOST_JSON))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
-    return content
 
 
 def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tuple[PreTrainedConfig, tuple[str, ...]]:
@@ -217,9 +208,9 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
 
 def _reason(error: BaseException) -> str:
     """Message of an error and of its cause, which draccus leaves out."""
-    said = " ".join(str(error).split())[:300]
+    text = " ".join(str(error).split())[:300]
     behind = " ".join(str(error.__cause__ or error.__context__ or "").split())[:200]
-    return said if not behind or behind in said else f"{said} ({behind})"
+    return text if not behind or behind in text else f"{text} ({behind})"
 
 
 def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
@@ -231,7 +222,7 @@ def _processors(folder: Path, config: PreTrainedConfig) -> dict[str, str]:
             raise InputError(
                 f"{folder}: holds no {name}; LeRobot's migrate_policy_normalization.py makes one for old checkpoints"
             )
-        steps = _json(path).get("steps")
+        steps = read_object(path, MOST_JSON).get("steps")
         if not isinstance(steps, list):
             raise InputError(f"{path}: steps is {type(steps).__name__}, expected a list")
         for index, step in enumerate(steps):
@@ -265,11 +256,11 @@ def _check_normaliser(where: str, options: Mapping[str, object], state: object, 
     eps = options.get("eps", 0.0)
     if isinstance(eps, bool) or not isinstance(eps, int | float) or not 0.0 <= eps < math.inf:
         raise InputError(f"{where}.config.eps is {eps!r:.40}, expected a number of at least 0")
-    said = {kind: mode.value for kind, mode in config.normalization_mapping.items()}
-    if options.get("norm_map") != said:
+    facts = {kind: mode.value for kind, mode in config.normalization_mapping.items()}
+    if options.get("norm_map") != facts:
         given = f"{options.get('norm_map')!r:.120}"
-        raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {said}")
-    if state is None and set(said.values()) != {"IDENTITY"}:
+        raise InputError(f"{where}.config.norm_map is {given}, but {CONFIG_FILE} has normalization_mapping {facts}")
+    if state is None and set(facts.values()) != {"IDENTITY"}:
         raise InputError(f"{where} names no state_file, the statistics by which it is to normalise")
 
 
@@ -298,12 +289,13 @@ def _features(
         if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
             picture = (int(shape[1]), int(shape[2]))
             continue
-        if given == TASK_VECTOR and facts.task_vector and shape == (len(facts.task_vector),):
+        if given == TASK_VECTOR and facts.task_vector and shape == (facts.vector_width,):
             continue
         if name.startswith("observation.images.empty_camera_") and config.type == "pi05":
             continue  # the network fills it with an empty picture itself
         if given == TASK_VECTOR:
-            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks for it"
+            trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
+            said = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
             raise InputError(f"{path}: input {name} is {_shape(feature)}, but {said}")
         known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
@@ -311,8 +303,8 @@ def _features(
         if renamed.get(name, name) not in inputs:
             raise InputError(f"{path}: has no input {renamed.get(name, name)}, which every policy here is given")
     if own and picture is not None and picture != (facts.height, facts.width):
-        said = f"{FACTS_FILE} says {facts.width}x{facts.height}"
-        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {said}")
+        text = f"{FACTS_FILE} says {facts.width}x{facts.height}"
+        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {text}")
     return picture
 
 

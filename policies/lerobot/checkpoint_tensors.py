@@ -85,16 +85,16 @@ def check_family(path: Path, kind: str) -> None:
     """
     with _opened(path) as file:
         found = sorted(file.keys())
-    said = f"but {CONFIG_FILE} says type {kind}"
+    text = f"but {CONFIG_FILE} says type {kind}"
     belongs = _FAMILIES[kind].always + _FAMILIES[kind].sometimes
     for name in found:
         if not name.startswith(belongs):
             own = [one for one, names in _FAMILIES.items() if name.startswith(names.always + names.sometimes)]
             whose = f" of {own[0]}" if own else ""
-            raise InputError(f"{path}: holds the tensor {name:.120}{whose}, {said}, which has none of that name")
+            raise InputError(f"{path}: holds the tensor {name:.120}{whose}, {text}, which has none of that name")
     for start in _FAMILIES[kind].always:
         if not any(name.startswith(start) for name in found):
-            raise InputError(f"{path}: holds no tensor {start}*, {said}, which needs it")
+            raise InputError(f"{path}: holds no tensor {start}*, {text}, which needs it")
 
 
 def check_layers(path: Path, kind: str, config: object) -> None:
@@ -112,10 +112,10 @@ def check_layers(path: Path, kind: str, config: object) -> None:
         names = list(file.keys())
     for field, start in _LAYERS.get(kind, {}).items():
         held = len({name[len(start) :].partition(".")[0] for name in names if name.startswith(start)})
-        said = getattr(config, field)
-        said = said if isinstance(said, int) else len(said)
-        if held and said != held:
-            raise InputError(f"{path}: holds {held} layers {start}*, but {CONFIG_FILE} says {field} {said}")
+        declared = getattr(config, field)
+        declared = declared if isinstance(declared, int) else len(declared)
+        if held and declared != held:
+            raise InputError(f"{path}: holds {held} layers {start}*, but {CONFIG_FILE} says {field} {declared}")
 
 
 @contextmanager
@@ -177,9 +177,9 @@ def check_spread(path: Path, feature: str, stats: Mapping[str, torch.Tensor]) ->
         return
     constant = torch.equal(*ends) if len(ends) > 1 else not bool(ends[0].any())
     if constant:
-        said = " equals ".join(stats) if len(ends) > 1 else f"{next(iter(stats))} is 0"
+        text = " equals ".join(stats) if len(ends) > 1 else f"{next(iter(stats))} is 0"
         raise InputError(
-            f"{path}: {feature}: {said} in all {ends[0].numel()} numbers, by which nothing can be normalised; "
+            f"{path}: {feature}: {text} in all {ends[0].numel()} numbers, by which nothing can be normalised; "
             "compute the statistics of its dataset again"
         )
 

@@ -31,7 +31,7 @@ class ChunkMemory:
             device: Torch device of the actions.
             observations: Ticks that the policy looks at.
             predicted: Actions of an answer of the network.
-            executed: Actions of an answer that are executed before the next look.
+            executed: Actions of an answer that are executed before the next query.
             ensemble: Execute at each tick the mean, with equal weights, of all answers that cover it.
         """
         self.worlds, self.executed = worlds, executed
@@ -42,7 +42,7 @@ class ChunkMemory:
         if ensemble:
             self._sum = torch.zeros((worlds, predicted, ACTION_WIDTH), device=device)
             self._count = torch.zeros((worlds, predicted, 1), device=device)
-        # Whole chunks for who looks at one tick; else the last ones singly, so that every tick of a look is seen.
+        # Whole chunks where one tick is seen; else the last ones singly, so that every tick of a query is seen.
         singles = min(observations - 1, executed - 1)
         self._pieces = [executed - singles, *([1] * singles)]
 
@@ -60,18 +60,18 @@ class ChunkMemory:
         """Remember what a world shows at a tick at which it asks."""
         self._glimpses[world] = [*self._glimpses[world], seen][-self._observations :]
 
-    def looked_at(self, world: int) -> list[Glimpse]:
-        """The ticks of a look, oldest first; at an episode's beginning the first one stands for those before it."""
+    def queried(self, world: int) -> list[Glimpse]:
+        """The ticks of a query, oldest first; at an episode's beginning the first one stands for those before it."""
         kept = self._glimpses[world]
         return [kept[0]] * (self._observations - len(kept)) + kept
 
     def answer(self, worlds: Sequence[int], chunks: torch.Tensor) -> None:
-        """Take the network's answers to a look of some worlds, shape [len(worlds), predicted, 40]."""
+        """Take the network's answers to a query of some worlds, shape [len(worlds), predicted, 40]."""
         if self._sum is not None and self._count is not None:
             rows, k = list(worlds), self.executed
             left = chunks.shape[1] - k
             total, count = torch.zeros_like(chunks), torch.zeros_like(self._count[rows])
-            # What was executed since the last look has left; of a first look nothing is kept yet.
+            # What was executed since the last query has left; of a first query nothing is kept yet.
             total[:, :left], count[:, :left] = self._sum[rows, k:], self._count[rows, k:]
             self._sum[rows], self._count[rows] = total + chunks, count + 1.0
             chunks = self._sum[rows] / self._count[rows]

@@ -8,7 +8,6 @@ of its encoders and its tokenizer, so that it opens without a hub (`checkpoint_e
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +33,8 @@ from transformers.utils import logging as transformers_logging
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.files import limits
+from arena_newton.files.stored_json import read_object
 
 __all__ = [
     "CLIP_FOLDER",
@@ -299,11 +300,5 @@ def checkpoint_encoders(folder: Path) -> Iterator[None]:
         if (folder / TOKENIZER_FOLDER).is_dir():
             stack.enter_context(tokenizer_from(read_tokenizer(folder / TOKENIZER_FOLDER)))
         if (folder / GEMMA_FILE).is_file():
-            try:
-                sizes = json.loads((folder / GEMMA_FILE).read_bytes())
-            except (ValueError, RecursionError) as error:
-                raise InputError(f"{folder / GEMMA_FILE}: not readable as JSON ({error})") from None
-            if not isinstance(sizes, dict):
-                raise InputError(f"{folder / GEMMA_FILE}: expected an object")
-            stack.enter_context(gemma_of(sizes))
+            stack.enter_context(gemma_of(read_object(folder / GEMMA_FILE, limits.MIB)))
         yield

@@ -1,6 +1,6 @@
-"""The random numbers of policies that sample their actions: drawn per episode and look, never from a common one.
+"""The random numbers of policies that sample their actions: drawn per episode and query, never from a common one.
 
-An episode's noise follows from its seed and from how often it has looked, so that it depends neither on other worlds
+An episode's noise follows from its seed and from the number of its queries, so that it depends neither on other worlds
 nor on what else drew numbers. It is drawn on the CPU, whatever the device is.
 """
 
@@ -24,15 +24,15 @@ class Draw:
 
     seed: int
     """Seed that the policy was given of the episode."""
-    look: int
-    """Looks of the episode before this one."""
+    query: int
+    """Queries of the episode before this one."""
 
 
 def generators(draws: Sequence[Draw]) -> list[torch.Generator]:
     """A new generator per row; its seed is the first 63 bits of `NOISE_RULE`."""
     found = []
     for draw in draws:
-        digest = hashlib.sha256(f"{draw.seed}|{draw.look}".encode()).digest()
+        digest = hashlib.sha256(f"{draw.seed}|{draw.query}".encode()).digest()
         found.append(torch.Generator().manual_seed(int.from_bytes(digest[:8], "big") >> 1))
     return found
 

@@ -7,7 +7,6 @@ and no other (`lerobot/scripts/serve_lerobot_vla_http.py` of github.com/Allenhet
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import torch
 
 from arena_newton.errors import InputError
-from arena_newton.files.untrusted_files import read_bytes
+from arena_newton.files.stored_json import read_object
 
 __all__ = ["MOST_JSON", "TRAIN_CONFIG", "PicturePreparation"]
 
@@ -83,11 +82,7 @@ class PicturePreparation:
         path = folder / TRAIN_CONFIG
         if not path.is_file():
             return None
-        try:
-            content = json.loads(read_bytes(path, MOST_JSON))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: not readable as JSON ({error})") from None
-        transforms = _table(_table(content, path, "the file").get("dataset") or {}, path, "dataset")
+        transforms = _table(read_object(path, MOST_JSON).get("dataset") or {}, path, "dataset")
         chosen = _table(transforms.get("image_transforms") or {}, path, "dataset.image_transforms")
         listed = _table(chosen.get("tfs") or {}, path, "dataset.image_transforms.tfs")
         if not chosen.get("enable"):

@@ -12,6 +12,7 @@ import binascii
 import json
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from arena_newton.policies.protocols.policy_messages import (
     MAX_SEED,
     MAX_STEP,
     Begin,
-    Look,
+    Query,
     read_actions,
     read_count,
     read_picture,
@@ -34,18 +35,19 @@ from arena_newton.policies.protocols.wire_error import WireError
 __all__ = [
     "CLIENT_HEADER",
     "MAX_WORLD",
+    "chunk_of",
     "pack_begin",
     "pack_begun",
     "pack_chunk",
     "pack_config",
     "pack_failure",
-    "pack_look",
+    "pack_query",
     "read_client",
     "unpack_begin",
     "unpack_begun",
     "unpack_chunk",
     "unpack_config",
-    "unpack_look",
+    "unpack_query",
 ]
 
 CLIENT_HEADER = "X-Arena-Client"
@@ -106,19 +108,19 @@ def unpack_begun(body: bytes, where: str) -> tuple[bool, str]:
     return content.get("seeded") is True, plain_text(policy, 200) if isinstance(policy, str) else ""
 
 
-def pack_look(look: Look) -> bytes:
+def pack_query(query: Query) -> bytes:
     """Body of `/infer`."""
-    seen: dict[str, object] = {"state": [float(v) for v in look.state]}
-    if look.image is not None:
-        data = base64.b64encode(np.ascontiguousarray(look.image).tobytes()).decode("ascii")
-        seen["images"] = {"front": {"shape": list(look.image.shape), "dtype": "uint8", "data_b64": data}}
-    content: dict[str, object] = {"observation": seen, "robot_type": look.robot_type, "return_chunk": True}
-    content |= {"task": look.task, "instruction": look.instruction}
-    more = {"world": int(look.session) if look.session else None, "step": look.step, "seed": look.seed}
+    seen: dict[str, object] = {"state": [float(v) for v in query.state]}
+    if query.image is not None:
+        data = base64.b64encode(np.ascontiguousarray(query.image).tobytes()).decode("ascii")
+        seen["images"] = {"front": {"shape": list(query.image.shape), "dtype": "uint8", "data_b64": data}}
+    content: dict[str, object] = {"observation": seen, "robot_type": query.robot_type, "return_chunk": True}
+    content |= {"task": query.task, "instruction": query.instruction}
+    more = {"world": int(query.session) if query.session else None, "step": query.step, "seed": query.seed}
     return _dumped(content | {key: value for key, value in more.items() if value is not None})
 
 
-def unpack_look(body: bytes | bytearray) -> tuple[Look, bool]:
+def unpack_query(body: bytes | bytearray) -> tuple[Query, bool]:
     """Observation in the body of `/infer`, and whether a whole chunk is wanted.
 
     Raises:
@@ -135,7 +137,7 @@ def unpack_look(body: bytes | bytearray) -> tuple[Look, bool]:
     picture, chunk = pictures.get("front"), content.get("return_chunk", False)
     if not isinstance(chunk, bool):
         raise WireError(f"{where}: return_chunk is {_kind(chunk)}, expected true or false")
-    look = Look(
+    query = Query(
         state=read_state(seen.get("state"), where),
         image=None if picture is None else _picture(picture, where),
         task=read_text(content.get("task"), where, "task"),
@@ -145,7 +147,7 @@ def unpack_look(body: bytes | bytearray) -> tuple[Look, bool]:
         step=read_count(content.get("step"), where, "step", MAX_STEP),
         robot_type=read_text(content.get("robot_type"), where, "robot_type"),
     )
-    return look, chunk
+    return query, chunk
 
 
 def pack_chunk(actions: np.ndarray, *, chunk: bool = True) -> bytes:
@@ -170,8 +172,18 @@ def unpack_chunk(body: bytes, where: str) -> np.ndarray:
     content = _object(body, where)
     if "error" in content:
         raise WireError(f"{where}: the server says {plain_text(content['error'], 200)}")
-    rows = content.get("action_chunk", content.get("action"))
-    if not isinstance(rows, list):
+    return chunk_of(content, where)
+
+
+def chunk_of(content: Mapping[str, object], where: str) -> np.ndarray:
+    """The chunk of a reply's object, float32, shape [n, 40].
+
+    Raises:
+        WireError: It holds none.
+    """
+    rows = content.get("action_chunk")
+    rows = content.get("action") if rows is None else rows
+    if not isinstance(rows, list) or not rows:
         raise WireError(f"{where}: the reply holds neither action_chunk nor action as lists of numbers")
     return read_actions(rows, where)
 

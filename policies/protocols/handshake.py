@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
 
 from arena_newton.data.readers.label_protocols import LABELS, action_names
 from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import InputError
+from arena_newton.files.stored_json import Fit, Known, loaded
 from arena_newton.files.text import plain_text
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, PICTURE_SIDES
 from arena_newton.policies.protocols.wire_error import WireError
@@ -28,15 +30,31 @@ MOST_NAMES = 4096
 """Most names of a list."""
 
 
+def _is_json(value: object) -> bool:
+    """True if results can hold a value; MessagePack knows more than JSON."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
+
+
+Side = Annotated[int, Fit("pixels", lambda value: PICTURE_SIDES[0] <= value <= PICTURE_SIDES[1])]
+Names = Annotated[tuple[str, ...], Fit("a list of names", lambda value: len(value) <= MOST_NAMES)]
+Length = Annotated[int, Fit("a number of actions", lambda value: 0 <= value <= LONGEST_CHUNK)]
+Labels = Annotated[str, Known(lambda: LABELS)]
+Facts = Annotated[Mapping[str, object], Fit("a JSON object", _is_json)]
+
+
 @dataclass(frozen=True)
 class ServedPicture:
     """The picture that a policy wants."""
 
-    width: int
+    width: Side
     """[px]"""
-    height: int
+    height: Side
     """[px]"""
-    fit: str = "pad"
+    fit: Literal["pad", "native"] = "pad"
     """`pad` or `native`, as in `CameraConfig`."""
 
 
@@ -46,18 +64,18 @@ class ServedFacts:
 
     policy: str = ""
     """Identity in results: the policy's name and a hash of its description."""
-    labels: str | None = None
+    labels: Labels | None = None
     """Protocol of its actions (`data.readers.label_protocols`)."""
-    realign: float | None = None
+    realign: Annotated[float, Fit("0 to 1", lambda value: 0 <= value <= 1)] | None = None
     """Fraction of the gap between the commanded and the measured heading that whoever decodes actions of v4 closes each
     tick; of v4 only."""
-    action_names: tuple[str, ...] | None = None
+    action_names: Names | None = None
     """Names of the numbers of an action, in their order."""
-    state_names: tuple[str, ...] | None = None
+    state_names: Names | None = None
     """Names of the numbers of a state, in their order."""
-    chunk_length: int | None = None
+    chunk_length: Length | None = None
     """Actions per chunk; 0: they differ."""
-    rate_hz: float | None = None
+    rate_hz: Annotated[float, Fit("a rate", lambda value: 0 < value < 1e6)] | None = None
     """Actions per second [Hz]."""
     needs_picture: bool | None = None
     """True if the policy observes pictures."""
@@ -67,7 +85,7 @@ class ServedFacts:
     """True if one request may hold several robots, along a leading axis."""
     seeded: bool = False
     """True if an episode follows from its seed and its observations, whoever else asks."""
-    facts: Mapping[str, object] = field(default_factory=dict)
+    facts: Facts = field(default_factory=dict)
     """The policy's own description, `Policy.describe`."""
 
     def to_json(self) -> dict[str, object]:
@@ -92,7 +110,7 @@ class ServedFacts:
 
     def undeclared(self) -> list[str]:
         """Names of what the server does not declare, as a message lists them."""
-        said = {
+        facts = {
             "label protocol": self.labels,
             "action names": self.action_names,
             "state names": self.state_names,
@@ -100,7 +118,7 @@ class ServedFacts:
             "rate": self.rate_hz,
             "picture": self.needs_picture if self.needs_picture is not True else self.picture,
         }
-        return [name for name, value in said.items() if value is None]
+        return [name for name, value in facts.items() if value is None]
 
 
 def expected_facts(labels: str = "v3.1") -> ServedFacts:
@@ -127,39 +145,13 @@ def read_facts(content: object, where: str) -> ServedFacts:
     if content["arena"] != HANDSHAKE_VERSION or isinstance(content["arena"], bool):
         version = plain_text(content["arena"], 40)
         raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
-    facts, policy, rate = content.get("facts", {}), content.get("policy", ""), content.get("rate_hz")
-    labels = content.get("labels")
-    if labels is not None and (not isinstance(labels, str) or labels not in LABELS):
-        raise _unfit(where, "labels", labels)
-    if not isinstance(policy, str):
-        raise _unfit(where, "policy", policy)
-    if not isinstance(facts, Mapping) or not all(isinstance(key, str) for key in facts):
-        raise _unfit(where, "facts", facts)
+    declared = {key: value for key, value in content.items() if value is not None}
     try:
-        json.dumps(facts, allow_nan=False)  # results hold them; MessagePack knows more than JSON
-    except (TypeError, ValueError, RecursionError):
-        raise _unfit(where, "facts", "something that is not JSON") from None
-    if rate is not None and (isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < 1e6):
-        raise _unfit(where, "rate_hz", rate)
-    realign = content.get("realign")
-    if realign is not None and (
-        isinstance(realign, bool) or not isinstance(realign, int | float) or not 0 <= realign <= 1
-    ):
-        raise _unfit(where, "realign", realign)
-    return ServedFacts(
-        policy=plain_text(policy, 200),
-        labels=labels,
-        realign=None if realign is None else float(realign),
-        action_names=_names(content, "action_names", where),
-        state_names=_names(content, "state_names", where),
-        chunk_length=_whole(content, "chunk_length", where, 0, LONGEST_CHUNK),
-        rate_hz=None if rate is None else float(rate),
-        needs_picture=_flag(content, "needs_picture", where),
-        picture=_picture(content.get("picture"), where),
-        batched=_flag(content, "batched", where) or False,
-        seeded=_flag(content, "seeded", where) or False,
-        facts=dict(facts),
-    )
+        facts = loaded(f"{where}: the server declares what cannot be", declared, ServedFacts)
+    except InputError as error:
+        raise WireError(str(error)) from None
+    realign, rate = (None if number is None else float(number) for number in (facts.realign, facts.rate_hz))
+    return replace(facts, policy=plain_text(facts.policy, 200), realign=realign, rate_hz=rate)
 
 
 def compare_facts(declared: ServedFacts, wanted: ServedFacts, where: str) -> None:
@@ -205,44 +197,3 @@ def _compare_names(declared: Sequence[str] | None, wanted: Sequence[str] | None,
             raise InputError(
                 f"{where}: number {index} of the server's {noun} is {plain_text(theirs, 80)}, of the robot's {ours}"
             )
-
-
-def _unfit(where: str, name: str, value: object) -> WireError:
-    return WireError(f"{where}: the server declares {name} as {plain_text(value, 60)!r}, which it cannot be")
-
-
-def _names(content: Mapping[str, object], name: str, where: str) -> tuple[str, ...] | None:
-    value = content.get(name)
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) > MOST_NAMES or not all(isinstance(one, str) for one in value):
-        raise _unfit(where, name, value)
-    return tuple(value)
-
-
-def _whole(content: Mapping[str, object], name: str, where: str, least: int, most: int) -> int | None:
-    value = content.get(name)
-    if value is None:
-        return None
-    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-        raise _unfit(where, name, value)
-    return value
-
-
-def _flag(content: Mapping[str, object], name: str, where: str) -> bool | None:
-    value = content.get(name)
-    if value is not None and not isinstance(value, bool):
-        raise _unfit(where, name, value)
-    return value
-
-
-def _picture(value: object, where: str) -> ServedPicture | None:
-    if value is None:
-        return None
-    if not isinstance(value, Mapping):
-        raise _unfit(where, "picture", value)
-    width, height = (_whole(value, side, where, *PICTURE_SIDES) for side in ("width", "height"))
-    fit = value.get("fit", "pad")
-    if width is None or height is None or fit not in ("pad", "native"):
-        raise _unfit(where, "picture", dict(value))
-    return ServedPicture(width, height, str(fit))

@@ -20,7 +20,7 @@ from arena_newton.policies.protocols.policy_messages import (
     MAX_SEED,
     MAX_STEP,
     Begin,
-    Look,
+    Query,
     read_actions,
     read_count,
     read_picture,
@@ -86,12 +86,12 @@ def unpack_metadata(data: bytes | str, where: str) -> tuple[ServedFacts, Mapping
 
 
 def pack_request(
-    request: Look | Begin, *, roboarena: bool = False, image_key: str = IMAGE_KEY, extras: bool = True
+    request: Query | Begin, *, roboarena: bool = False, image_key: str = IMAGE_KEY, extras: bool = True
 ) -> bytes:
     """A request as the client sends it.
 
     Args:
-        request: openpi itself knows no beginning of an episode: there `seed` and `step` 0 of a look begin one.
+        request: openpi itself knows no beginning of an episode: there `seed` and `step` 0 of a query begin one.
         roboarena: Name endpoint and session.
         image_key: Key of the picture.
         extras: Add `task`, `seed` and `step`, which servers other than ours do not read.
@@ -100,7 +100,7 @@ def pack_request(
         WireError: A `Begin` without `roboarena`.
     """
     content: dict[str, object] = {}
-    if isinstance(request, Look):
+    if isinstance(request, Query):
         if request.image is not None:
             content[image_key] = np.ascontiguousarray(request.image)
         content[STATE_KEY] = np.ascontiguousarray(request.state, dtype=np.float32)
@@ -108,10 +108,10 @@ def pack_request(
     elif not roboarena:
         raise WireError("openpi knows no message for the beginning of an episode")
     if roboarena:
-        content["endpoint"] = "infer" if isinstance(request, Look) else "reset"
+        content["endpoint"] = "infer" if isinstance(request, Query) else "reset"
         content["session_id"] = request.session
     if extras:
-        step = request.step if isinstance(request, Look) else None
+        step = request.step if isinstance(request, Query) else None
         more = {"task": request.task or None, "seed": request.seed, "step": step}
         if isinstance(request, Begin):
             more[PROMPT_KEY] = request.instruction or None
@@ -119,7 +119,7 @@ def pack_request(
     return pack(content, OPENPI_KEYS)
 
 
-def unpack_request(data: bytes | str) -> tuple[Look | Begin, bool]:
+def unpack_request(data: bytes | str) -> tuple[Query | Begin, bool]:
     """A request, and whether it is RoboArena's.
 
     Raises:
@@ -141,7 +141,7 @@ def unpack_request(data: bytes | str) -> tuple[Look | Begin, bool]:
     if endpoint == "reset":
         return Begin(named, seed, task, prompt), True
     pictures = [content[key] for key in IMAGE_KEYS if key in content]
-    look = Look(
+    query = Query(
         state=read_state(content.get(STATE_KEY), WHERE),
         image=read_picture(pictures[0], WHERE) if pictures else None,
         task=task,
@@ -150,13 +150,13 @@ def unpack_request(data: bytes | str) -> tuple[Look | Begin, bool]:
         seed=seed,
         step=read_count(content.get("step"), WHERE, "step", MAX_STEP),
     )
-    return look, endpoint is not None
+    return query, endpoint is not None
 
 
 def pack_answer(
     actions: np.ndarray, infer_ms: float, prev_total_ms: float | None = None, *, roboarena: bool = False
 ) -> bytes:
-    """The answer to a look.
+    """The answer to a query.
 
     Args:
         actions: The chunk, shape [n, 40].

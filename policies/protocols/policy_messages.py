@@ -21,7 +21,7 @@ __all__ = [
     "PICTURE_SIDES",
     "Begin",
     "End",
-    "Look",
+    "Query",
     "Request",
     "check_picture_size",
     "read_actions",
@@ -54,12 +54,12 @@ class Begin:
     seed: int | None = None
     """Episode seed; None: the server chooses."""
     task: str = ""
-    """Gym id or name of the task; empty: not said."""
+    """Gym id or name of the task; empty: not given."""
     instruction: str = ""
 
 
 @dataclass(frozen=True)
-class Look:
+class Query:
     """A robot shows what it sees and asks for a chunk."""
 
     state: np.ndarray
@@ -74,9 +74,9 @@ class Look:
     seed: int | None = None
     """As in `Begin`; with `step` 0 it begins an episode that no `Begin` has announced."""
     step: int | None = None
-    """Actions that the episode has executed so far; None: not said."""
+    """Actions that the episode has executed so far; None: not given."""
     robot_type: str = ""
-    """The label protocol's `robot_type` that the robot executes; empty: not said."""
+    """The label protocol's `robot_type` that the robot executes; empty: not given."""
     packed: PackedPicture | None = None
     """The picture as its sender packed it, instead of `image`."""
 
@@ -91,7 +91,7 @@ class End:
     """The robot's report of it."""
 
 
-type Request = Begin | Look | End
+type Request = Begin | Query | End
 """Message of a robot."""
 
 

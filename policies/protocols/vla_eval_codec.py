@@ -2,7 +2,7 @@
 
 The robot says `hello` and is answered by one; then `episode_start`, `observation` (each answered by an `action` or an
 `error` of the same `seq`) and `episode_end`. Pictures are PNG, JPEG or raw. A server of that harness answers one action
-a look and keeps the rest of its chunk; a robot whose `hello` names the capability `chunks` is given whole ones by ours.
+per query and keeps the rest of its chunk; ours gives whole ones to a robot whose `hello` names the capability `chunks`.
 Sources: `vla_eval/protocol/{messages,numpy_codec,image_codec}.py`, `vla_eval/model_servers/serve.py` of
 github.com/allenai/vla-evaluation-harness at e1ee9ad. `task`, `seed`, `step` and `session` are ours.
 """
@@ -27,7 +27,7 @@ from arena_newton.policies.protocols.policy_messages import (
     MAX_STEP,
     Begin,
     End,
-    Look,
+    Query,
     Request,
     read_actions,
     read_count,
@@ -149,7 +149,7 @@ def pack_request(request: Request, seq: int, timestamp: float, images: ImageForm
     """A request as the robot sends it."""
     payload: dict[str, object]
     match request:
-        case Look():
+        case Query():
             payload = {"task_description": request.instruction, "states": request.state.astype(np.float32)}
             payload["images"] = {} if request.image is None else {CAMERA: np.ascontiguousarray(request.image)}
             more = {"step": request.step, "seed": request.seed, "task": request.task or None}
@@ -190,7 +190,7 @@ def unpack_request(message: VlaEvalMessage) -> Request:
         raise WireError(f"{WHERE}: several pictures, and none is named {CAMERA}")
     picture: object = pictures.get(CAMERA, next(iter(pictures.values()), None))
     packed = picture if isinstance(picture, PackedPicture) else None
-    return Look(
+    return Query(
         state=read_state(payload.get("states"), WHERE),
         image=None if picture is None or packed is not None else read_picture(picture, WHERE),
         packed=packed,
@@ -203,7 +203,7 @@ def unpack_request(message: VlaEvalMessage) -> Request:
 
 
 def pack_action(actions: np.ndarray, seq: int, timestamp: float) -> bytes:
-    """The answer to a look: a chunk [n, 40], or one action [40] for a robot that knows no chunks."""
+    """The answer to a query: a chunk [n, 40], or one action [40] for a robot that knows no chunks."""
     return pack_message("action", {"actions": actions.astype(np.float32)}, seq, timestamp, "raw")
 
 
@@ -217,18 +217,18 @@ def unpack_action(message: VlaEvalMessage, seq: int, where: str) -> np.ndarray:
 
     Args:
         message: The answer.
-        seq: Of the look that it must answer.
+        seq: Of the query that it must answer.
         where: What errors name as the origin.
 
     Raises:
-        WireError: An error of the server, shown in one line, or not the answer to this look, or no chunk.
+        WireError: An error of the server, shown in one line, or not the answer to this query, or no chunk.
     """
     if message.type == "error":
         raise WireError(f"{where}: the server says {plain_text(message.payload.get('error', 'nothing'), 200)}")
     if message.type != "action":
         raise WireError(f"{where}: a message of type {message.type}, expected action")
     if message.seq != seq:
-        raise WireError(f"{where}: the answer to look {message.seq}, expected that to {seq}")
+        raise WireError(f"{where}: the answer to query {message.seq}, expected that to {seq}")
     return read_actions(message.payload.get("actions", message.payload.get("action")), where)
 
 

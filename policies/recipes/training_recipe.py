@@ -80,11 +80,13 @@ class TrainingRecipe:
     """`float32`, or `bfloat16` of autocast (of pi0.5: of the weights)."""
     seed: int = 42
     chunk: int = 20
-    """Actions that are executed without a new look."""
+    """Actions that are executed without a new query."""
     horizon: int = 20
     """Actions that the network predicts."""
     picture: int = 224
-    """Width and height of the picture [px]."""
+    """Width and height of the datasets' pictures [px]."""
+    cut_pad: bool = False
+    """The network sees the 4:3 picture without the black rows around it."""
     shift_px: int = 0
     """Training pictures are shifted by up to this in each direction [px]."""
     colour: float = 0.0
@@ -133,6 +135,11 @@ class TrainingRecipe:
     def type(self) -> str:
         """LeRobot's name of the policy."""
         return FAMILIES[self.family]
+
+    @property
+    def height(self) -> int:
+        """Height of the picture that the network sees [px]; its width is `picture`."""
+        return self.picture * 3 // 4 if self.cut_pad else self.picture
 
     def lr_factor(self, step: int) -> float:
         """Factor of the learning rates in the step of a number, the first being 0.
@@ -298,8 +305,13 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
         "network": {"freeze_vision_encoder": True},
     },
     ("*", "fast"): _FAST,
-    ("act", "fast"): {"batch_norm": True, "network": {"pretrained_backbone_weights": None}},
+    ("act", "fast"): {
+        "batch_norm": True,
+        "cut_pad": True,
+        "network": {"pretrained_backbone_weights": None, "use_vae": False},
+    },
     ("diffusion", "fast"): {
+        "cut_pad": True,
         "weight_decay": 1e-6,
         "betas": (0.95, 0.999),
         "network": {

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from arena_newton.errors import InputError
 
 __all__ = [
-    "DOORS",
+    "PREFIXES",
     "TOKEN_VARIABLE",
     "ServerAddress",
     "cause",
@@ -21,7 +21,7 @@ __all__ = [
 
 TOKEN_VARIABLE = "ARENA_POLICY_TOKEN"
 """Environment variable with the token that is sent as `Authorization: Bearer`; it is neither printed nor stored."""
-DOORS: dict[str, tuple[str, str, int]] = {
+PREFIXES: dict[str, tuple[str, str, int]] = {
     "http": ("arena", "http", 80),
     "https": ("arena", "https", 443),
     "ws": ("openpi", "ws", 80),
@@ -96,15 +96,15 @@ def read_address(url: str) -> ServerAddress:
         port = parts.port
     except ValueError as error:
         raise InputError(f"--policy remote:{shown}: not an address ({one_line(error)})") from None
-    if "://" in url and parts.scheme and parts.scheme not in DOORS:
-        known = ", ".join(f"{door}://" for door in DOORS if "+" not in door)
+    if "://" in url and parts.scheme and parts.scheme not in PREFIXES:
+        known = ", ".join(f"{prefix}://" for prefix in PREFIXES if "+" not in prefix)
         raise InputError(f"--policy remote:{shown}: unknown protocol {parts.scheme}://, choose from {known}")
-    if parts.scheme not in DOORS or not parts.hostname or parts.query or parts.fragment or port == 0:
+    if parts.scheme not in PREFIXES or not parts.hostname or parts.query or parts.fragment or port == 0:
         raise InputError(
             f"--policy remote:{shown}: expected http://host:port, https://, ws:// or another known protocol, and "
             "nothing more"
         )
-    spoken, transport, usual = DOORS[parts.scheme]
+    spoken, transport, usual = PREFIXES[parts.scheme]
     if transport == "tcp" and parts.path.strip("/"):
         raise InputError(f"--policy remote:{shown}: expected {parts.scheme}://host:port and nothing more")
     return ServerAddress(spoken, transport, parts.hostname, port or usual, parts.path.rstrip("/"))

@@ -6,7 +6,6 @@ of other servers (docs/serving.md), each in its own module `remote_*`.
 
 from __future__ import annotations
 
-import base64
 import functools
 import http.client
 import importlib
@@ -26,15 +25,14 @@ from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Json, Observation
-from arena_newton.policies.protocols.arena_codec import CLIENT_HEADER
+from arena_newton.policies.protocols import arena_codec
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import TOKEN_VARIABLE, read_address
-from arena_newton.policies.remote.client import MAX_CHUNK, MAX_FAILURES, MAX_REPLY, RemoteClient
+from arena_newton.policies.remote.client import MAX_FAILURES, MAX_REPLY, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink, episode_lost
-from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
-__all__ = ["MAX_CHUNK", "MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
+__all__ = ["MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
 
 ROBOT_TYPE = LABELS["v3.1"].robot_type
 """Robot type that the original's server checks: actions of v3.1; those of other protocols have their own."""
@@ -173,7 +171,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
     @property
     def headers(self) -> dict[str, str]:
         """With a name, by which a server tells the worlds of this client from those of others on this machine."""
-        return {**super().headers, CLIENT_HEADER: self._name}
+        return {**super().headers, arena_codec.CLIENT_HEADER: self._name}
 
     def check(self) -> None:
         """Reach the server, begin an episode there, and read what it declares.
@@ -216,43 +214,13 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         return _Connection(self.url, server, self.address.path, self.context, self.headers)
 
     def _beginning(self, world: int, task: str) -> bytes | None:
-        return json.dumps({"seed": self._seeds[world], "world": world, "task": task}).encode()
+        return arena_codec.pack_begin(self._begin(world, task))
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        shown: Json = {"state": [float(v) for v in state[world, :STATE_WIDTH]]}
-        if image is not None:
-            picture = np.ascontiguousarray(image[world], dtype=np.uint8)
-            data = base64.b64encode(picture.tobytes()).decode("ascii")
-            shown["images"] = {"front": {"shape": list(picture.shape), "dtype": "uint8", "data_b64": data}}
-        body = {
-            "observation": shown,
-            "robot_type": self.protocol.robot_type,
-            "return_chunk": True,
-            "task": seen.gym_id,
-            # Not sent by the original's client, and not read by its server.
-            "instruction": seen.instruction,
-            "world": world,
-            "step": self._steps.get(world, 0),
-        }
-        if world in self._seeds:
-            body["seed"] = self._seeds[world]
-        return json.dumps(body).encode()
+        return arena_codec.pack_query(self._query(seen, state, image, world))
 
     def _rows(self, content: object) -> np.ndarray:
-        where, reply = f"{self.url}/infer", _object(content)
-        rows = reply.get("action_chunk")
-        if rows is None and "action" in reply:
-            rows = [reply["action"]]
-        if not isinstance(rows, list) or not rows or not all(isinstance(r, list) for r in rows):
-            raise RemoteError(f"{where}: the reply holds neither action_chunk nor action as lists of numbers")
-        if len(rows) > MAX_CHUNK:
-            raise RemoteError(f"{where}: a chunk of {len(rows)} actions, expected at most {MAX_CHUNK}")
-        for row in rows:
-            if len(row) != ACTION_WIDTH:
-                raise RemoteError(f"{where}: an action of {len(row)} numbers, expected {ACTION_WIDTH}")
-            if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in row):
-                raise RemoteError(f"{where}: an action holds something that is not a number")
-        return self.checked(rows)
+        return self.checked(arena_codec.chunk_of(_object(content), f"{self.url}/infer"))
 
     def _read(self, kind: str, reply: _Reply) -> Json:
         status, data = reply
@@ -265,8 +233,8 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
             raise RemoteError(f"{where}: the reply is not JSON") from error
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
-            said = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            raise RemoteError(f"{where}: status {status}{said}", silent=silent, lost=episode_lost(said))
+            text = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
+            raise RemoteError(f"{where}: status {status}{text}", silent=silent, lost=episode_lost(text))
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

@@ -25,13 +25,13 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CameraConfig
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, compare_facts, expected_facts
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
 from arena_newton.policies.remote.link import RemoteError, ServerLink
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE, STATE_WIDTH
 
 __all__ = [
-    "MAX_CHUNK",
     "MAX_FAILURES",
     "MAX_REPLY",
     "RemoteClient",
@@ -40,8 +40,6 @@ __all__ = [
 
 MAX_REPLY = 4 * 2**20
 """Longest reply for one world that is read [bytes]."""
-MAX_CHUNK = 4096
-"""Longest chunk that is accepted [actions]."""
 MAX_CONNECTIONS = 32
 """Requests that are under way at once."""
 MAX_FAILURES = 10
@@ -60,7 +58,7 @@ class RemoteClient[Q, R](Policy):
     """Name of an episode's beginning in errors."""
     infer_kind: ClassVar[str] = " (infer)"
     """Name of a request for actions in errors."""
-    said: ClassVar[str] = "a policy server"
+    described: ClassVar[str] = "a policy server"
     """Name of the expected server in errors."""
 
     def __init__(
@@ -105,7 +103,7 @@ class RemoteClient[Q, R](Policy):
         self._lock, self._reading = threading.Lock(), threading.Lock()
         self.batched = False
         self.stateful = False
-        self.told = ServedFacts()
+        self.declared = ServedFacts()
         self._seeded = False
         self._served = ""
         self._assumed: Json = {}
@@ -196,7 +194,7 @@ class RemoteClient[Q, R](Policy):
             message += "; --remote-insecure does without the check"
         elif "status 401" in message or "status 403" in message:
             message += f"; a token is taken from the environment variable {TOKEN_VARIABLE}"
-        return InputError(f"--policy remote: no {self.said.removeprefix('a ')}: {message}")
+        return InputError(f"--policy remote: no {self.described.removeprefix('a ')}: {message}")
 
     def take(self, facts: ServedFacts) -> None:
         """Compare what a server declares with what this robot takes, and follow it where either is possible.
@@ -211,7 +209,7 @@ class RemoteClient[Q, R](Policy):
             compare_facts(facts, expected_facts(asked or facts.labels or self.protocol.name), where)
         except InputError as error:
             raise InputError(self.masked(str(error))) from None
-        self.told = replace(facts, facts=cast(Json, self.without_token(facts.facts)))
+        self.declared = replace(facts, facts=cast(Json, self.without_token(facts.facts)))
         if facts.labels is not None:
             self.protocol, self.labels = LABELS[facts.labels], facts.labels
         if facts.needs_picture is not None:
@@ -226,7 +224,7 @@ class RemoteClient[Q, R](Policy):
 
     def assume(self) -> None:
         """Say once, on stderr, what the server does not declare, and keep for `describe` what is taken instead."""
-        missing = self.told.undeclared()
+        missing = self.declared.undeclared()
         if not missing:
             return
         camera = self.camera or CameraConfig()
@@ -239,9 +237,9 @@ class RemoteClient[Q, R](Policy):
             "picture": f"{camera.width}x{camera.height} {camera.fit}",
         }
         self._assumed = {name: taken[name] for name in missing}
-        said = ", ".join(f"{name} ({value})" for name, value in self._assumed.items())
+        text = ", ".join(f"{name} ({value})" for name, value in self._assumed.items())
         print(
-            f"--policy remote:{self.url}: the server does not declare its {said}: what stands in brackets is assumed",
+            f"--policy remote:{self.url}: the server does not declare its {text}: what stands in brackets is assumed",
             file=sys.stderr,
             flush=True,
         )
@@ -330,15 +328,16 @@ class RemoteClient[Q, R](Policy):
         self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
         """Chunks and errors of the worlds that need a new one."""
-        if not self.batched:
-            requests = {world: self._request(seen, state, image, world) for world in worlds}
-            return self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
-        # A server may refuse a batch for one row of it.
+        # A server may refuse a batch for one row of it, and JSON has no such numbers.
         broken = [world for world in worlds if not np.isfinite(state[world]).all()]
         errors = dict.fromkeys(broken, "the state holds a number that is not finite")
         worlds = [world for world in worlds if world not in errors]
         if not worlds:
             return {}, errors
+        if not self.batched:
+            requests = {world: self._request(seen, state, image, world) for world in worlds}
+            got, failed = self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
+            return got, errors | failed
         request = self._batch(seen, state, image, worlds)
         got, failed = self._ask(
             self.infer_kind,
@@ -357,6 +356,21 @@ class RemoteClient[Q, R](Policy):
                 errors[world] = str(error)
         return chunks, errors
 
+    def _begin(self, world: int, task: str = "") -> Begin:
+        return Begin(session=str(world), seed=self._seeds.get(world), task=task)
+
+    def _query(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Query:
+        return Query(
+            state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
+            image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
+            task=seen.gym_id,
+            instruction=seen.instruction,
+            session=str(world),
+            seed=self._seeds.get(world),
+            step=self._steps.get(world, 0),
+            robot_type=self.protocol.robot_type,
+        )
+
     def describe(self) -> Json:
         """Address, order of the requests, and what the server says of itself; complete after `check`."""
         facts: Json = {
@@ -367,7 +381,7 @@ class RemoteClient[Q, R](Policy):
             "seeding": "per_request" if self._seeded else "undeclared",
             "worlds_matter": self.depends_on_worlds,
         }
-        declared = self.told.to_json() if self.told != ServedFacts() else {}
+        declared = self.declared.to_json() if self.declared != ServedFacts() else {}
         shown = ("labels", "realign", "chunk_length", "rate_hz", "picture", "batched", "facts")
         more = {"declared": {name: declared[name] for name in shown if name in declared}, "assumed": self._assumed}
         return facts | {name: value for name, value in more.items() if value}
@@ -401,8 +415,8 @@ class RemoteClient[Q, R](Policy):
             raise RemoteError(f"{where}: an action holds a number that is too large") from error
         if actions.ndim != 2 or not len(actions):
             raise RemoteError(f"{where}: actions of shape {list(actions.shape)}, expected [n, {ACTION_WIDTH}]")
-        if len(actions) > MAX_CHUNK:
-            raise RemoteError(f"{where}: a chunk of {len(actions)} actions, expected at most {MAX_CHUNK}")
+        if len(actions) > LONGEST_CHUNK:
+            raise RemoteError(f"{where}: a chunk of {len(actions)} actions, expected at most {LONGEST_CHUNK}")
         return actions
 
     def _ask[T](
@@ -520,9 +534,9 @@ class RemoteClient[Q, R](Policy):
             text = self.masked(str(error))
             raise RemoteError(text if text.startswith(self.url) else f"{self.url}{kind}: {text}") from error
 
-    def one_line(self, said: object) -> str:
+    def one_line(self, text: object) -> str:
         """Message of a server, on one line and without the token."""
-        return one_line(self.masked(str(said)))
+        return one_line(self.masked(str(text)))
 
     def without_token(self, value: object) -> object:
         """JSON of a server without the token, which one that repeats what it is sent would put into the results."""

@@ -113,7 +113,7 @@ class ModalityNames:
     labels: str | None = None
     """Label protocol that the names of the actions are of; None: they do not say."""
     chunk: int = 0
-    """Actions per chunk; 0: not said."""
+    """Actions per chunk; 0: not given."""
 
     def to_json(self) -> dict[str, object]:
         """The names as JSON."""
@@ -285,7 +285,7 @@ class Gr00tLink(ServerLink[bytes, bytes]):
 class Gr00tPolicy(RemoteClient[bytes, bytes]):
     """Asks a server of GR00T's protocol for all worlds at once."""
 
-    said = "a policy server of GR00T's protocol"
+    described = "a policy server of GR00T's protocol"
     camera = CameraConfig(width=640, height=480, fit="native")
     """The head camera as it is: GR00T's processors cut and resize by themselves."""
 
@@ -307,12 +307,12 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         """
         self.reach()
         self._connections[0] = self._connect()
-        said, errors = self._gather(" (ping)", {0: self._packed("ping")}, lambda content: content)
+        text, errors = self._gather(" (ping)", {0: self._packed("ping")}, lambda content: content)
         if errors:
             raise self.refusal(errors[0])
         where = f"--policy remote:{self.url}"
         try:
-            facts = read_facts(said[0] if isinstance(said[0], Mapping) else {}, where)
+            facts = read_facts(text[0] if isinstance(text[0], Mapping) else {}, where)
         except WireError as error:
             raise InputError(self.masked(str(error))) from None
         names, errors = self._gather(" (get_modality_config)", {0: self._packed("get_modality_config")}, lambda c: c)
@@ -376,7 +376,7 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         if self.names.language is not None:
             shown["language"] = {self.names.language: [[seen.instruction]] * len(rows)}
         options: dict[str, object] | None = None
-        if self.told.seeded:
+        if self.declared.seeded:
             options = {
                 "seed": [self._seeds.get(w, 0) for w in rows],
                 "step": [self._steps.get(w, 0) for w in rows],
@@ -390,8 +390,8 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
             raise RemoteError(f"{where}: the server says ERROR")
         content = unpack_gr00t(reply, where)
         if isinstance(content, dict) and "error" in content:
-            said = self.one_line(content["error"])
-            raise RemoteError(f"{where}: the server says {said}", lost=episode_lost(said))
+            declared = self.one_line(content["error"])
+            raise RemoteError(f"{where}: the server says {declared}", lost=episode_lost(declared))
         return content
 
     def _rows(self, content: object) -> np.ndarray:

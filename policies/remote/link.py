@@ -130,6 +130,6 @@ class ServerLink[Q, R]:
         raise TypeError(f"{type(self).__name__} defines no close()")
 
 
-def episode_lost(said: str) -> bool:
+def episode_lost(message: str) -> bool:
     """True if a server reports that it no longer knows the episode that is running, or is about to forget it."""
-    return any(text in said for text in NOT_KNOWN)
+    return any(text in message for text in NOT_KNOWN)

@@ -1,7 +1,7 @@
 """The policy that runs behind openpi's websocket protocol, or RoboArena's, which adds the beginning of an episode.
 
 A server sends its metadata first. Ours declares there what is compared before the first episode; of others a robot that
-stands is asked for one chunk, and what they do not declare is assumed and said.
+stands is asked for one chunk, and what they do not declare is assumed and reported.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class OpenpiLink(SocketLink):
             self.policy.text_of(answer, self.url + self.policy.reset_kind)
         return None
 
-    def look(self, request: SocketRequest, end: float) -> object:
+    def query(self, request: SocketRequest, end: float) -> object:
         """Show what a world sees, or all of a batch."""
         if request.batch is not None:
             self.send(request.batch)
@@ -74,7 +74,7 @@ class OpenpiLink(SocketLink):
 class OpenpiPolicy(SocketClient):
     """Asks a server of openpi's protocol."""
 
-    said = "a policy server of openpi's protocol"
+    described = "a policy server of openpi's protocol"
     camera = CameraConfig()
     """224×224 with black bars, as openpi's clients prepare pictures."""
 
@@ -125,8 +125,8 @@ class OpenpiPolicy(SocketClient):
         """
         if isinstance(answer, str):
             lines = [line for line in answer[-LONGEST_SAID:].splitlines() if line.strip()]
-            said = self.one_line(lines[-1]) if lines else "nothing"
-            raise RemoteError(f"{where}: the server says {said}", lost=episode_lost(said))
+            text = self.one_line(lines[-1]) if lines else "nothing"
+            raise RemoteError(f"{where}: the server says {text}", lost=episode_lost(text))
         raise RemoteError(f"{where}: a binary frame, expected the text {openpi_codec.RESET_ANSWER!r}")
 
     def _cameras(self) -> None:

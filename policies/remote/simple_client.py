@@ -1,7 +1,7 @@
 """The policy that runs behind SIMPLE's and Ψ₀'s HTTP protocol, `POST /act` (github.com/physical-superintelligence-lab).
 
-One JSON request for each look, with arrays as base64 of their bytes, type and shape; whatever a server remembers is
-begun anew by `history: {"reset": true}` of an episode's first look. The protocol names neither robot nor episode.
+One JSON request for each query, with arrays as base64 of their bytes, type and shape; whatever a server remembers is
+begun anew by `history: {"reset": true}` of an episode's first query. The protocol names neither robot nor episode.
 Source: `src/simple/baselines/client.py` and `psi0_decoupled_wbc.py` of SIMPLE.
 """
 
@@ -61,7 +61,7 @@ class SimplePolicy(RemotePolicy):
     """Asks a server of SIMPLE's protocol, one request per world."""
 
     infer_kind = "/act"
-    said = "a policy server of SIMPLE's protocol"
+    described = "a policy server of SIMPLE's protocol"
     camera = CameraConfig(width=640, height=480, fit="native")
     """640×480: its servers cut and resize."""
 
@@ -83,7 +83,7 @@ class SimplePolicy(RemotePolicy):
         return super().describe() | {"protocol": "simple"}
 
     def _beginning(self, world: int, task: str) -> bytes | None:
-        """None: the first look says that an episode begins."""
+        """None: the first query says that an episode begins."""
         return None
 
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:

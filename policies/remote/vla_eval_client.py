@@ -1,6 +1,6 @@
 """The policy that runs behind vla-eval's websocket protocol (github.com/allenai/vla-evaluation-harness).
 
-Both sides greet, then every message carries a number that its answer repeats. A server of that harness answers a look
+Both sides greet, then every message carries a number that its answer repeats. A server of that harness answers a query
 with one action and keeps the rest of its chunk; ours gives whole chunks, since our greeting says that we take them.
 """
 
@@ -43,7 +43,7 @@ class VlaEvalLink(SocketLink):
         return facts
 
     def begin(self, begin: Begin, end: float) -> object:
-        """Begin an episode; nobody answers that, and what went wrong is told with the first look."""
+        """Begin an episode; nobody answers that, and what went wrong is told with the first query."""
         if self.begun:
             self._number()
             self.send(vla_eval_codec.pack_request(End(begin.session), self.seq, time.time()))
@@ -51,13 +51,13 @@ class VlaEvalLink(SocketLink):
         self.send(vla_eval_codec.pack_request(begin, self.seq, time.time()))
         return None
 
-    def look(self, request: SocketRequest, end: float) -> object:
+    def query(self, request: SocketRequest, end: float) -> object:
         """Show what a world sees; the message that answers, and the number that it must repeat."""
         if request.message is not None:
             self._number()
             self.send(vla_eval_codec.pack_request(request.message, self.seq, time.time()))
         answer, seq = self._message(end), self.seq
-        if answer.seq != seq:  # what was sent for this look would answer the next one
+        if answer.seq != seq:  # what was sent for this query would answer the next one
             self.close()
         return answer, seq
 
@@ -76,7 +76,7 @@ class VlaEvalLink(SocketLink):
 class VlaEvalPolicy(SocketClient):
     """Asks a server of vla-eval's protocol."""
 
-    said = "a policy server of vla-eval's protocol"
+    described = "a policy server of vla-eval's protocol"
     camera = CameraConfig()
     """224×224 with black bars."""
 
@@ -105,8 +105,8 @@ class VlaEvalPolicy(SocketClient):
             return reply
         message, seq = reply
         if isinstance(message, VlaEvalMessage) and message.type == "error":
-            said = self.one_line(message.payload.get("error", "nothing"))
-            raise RemoteError(f"{self.url}{kind}: the server says {said}", lost=episode_lost(said))
+            declared = self.one_line(message.payload.get("error", "nothing"))
+            raise RemoteError(f"{self.url}{kind}: the server says {declared}", lost=episode_lost(declared))
         return message, seq
 
     def _rows(self, content: object) -> np.ndarray:

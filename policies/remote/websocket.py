@@ -21,12 +21,11 @@ from websockets.sync.client import ClientConnection, connect
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Observation
 from arena_newton.policies.protocols.handshake import ServedFacts
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import cause
 from arena_newton.policies.remote.client import MAX_REPLY, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink
-from arena_newton.robot.canonical import STATE_WIDTH
 
 __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
 
@@ -44,7 +43,7 @@ _SILENT.addHandler(logging.NullHandler())
 class SocketRequest:
     """Request of a world; links make it the bytes of their protocol."""
 
-    message: Begin | Look | None
+    message: Begin | Query | None
     """None: `batch` says it."""
     begin: Begin
     """Beginning of the episode, for connections that do not know it."""
@@ -78,9 +77,9 @@ class SocketLink(ServerLink[SocketRequest, object]):
         """Begin an episode; the reply, or None where the protocol has none."""
         raise TypeError(f"{type(self).__name__} defines no begin()")
 
-    def look(self, request: SocketRequest, end: float) -> object:
+    def query(self, request: SocketRequest, end: float) -> object:
         """Show what a world sees; the reply."""
-        raise TypeError(f"{type(self).__name__} defines no look()")
+        raise TypeError(f"{type(self).__name__} defines no query()")
 
     def unasked(self, frame: bytes | str) -> object:
         """The reply that a frame is for which nobody asked; None: it is none, and the connection is given up."""
@@ -120,7 +119,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
                 )
             self.begin(request.begin, end)
             self.begun = True
-        return self.look(request, end)
+        return self.query(request, end)
 
     def open(self, end: float) -> ServedFacts:
         """Connect and greet.
@@ -279,24 +278,9 @@ class SocketClient(RemoteClient[SocketRequest, object]):
         self._checked = True
         return self.greeting
 
-    def _begin(self, world: int, task: str = "") -> Begin:
-        return Begin(session=str(world), seed=self._seeds.get(world), task=task)
-
-    def _look(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Look:
-        return Look(
-            state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
-            image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
-            task=seen.gym_id,
-            instruction=seen.instruction,
-            session=str(world),
-            seed=self._seeds.get(world),
-            step=self._steps.get(world, 0),
-            robot_type=self.protocol.robot_type,
-        )
-
     def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> SocketRequest:
-        look = self._look(seen, state, image, world)
-        return SocketRequest(look, self._begin(world, seen.gym_id), look.step or 0)
+        query = self._query(seen, state, image, world)
+        return SocketRequest(query, self._begin(world, seen.gym_id), query.step or 0)
 
     def _beginning(self, world: int, task: str) -> SocketRequest | None:
         begin = self._begin(world, task)

@@ -72,10 +72,10 @@ class HttpRobots:
             robot.session = session
             return self._used(found, robot, connection), before
 
-    def looking(
+    def querying(
         self, address: str, client: str, connection: socket.socket, world: str, seed: int | None, *, begins: bool
     ) -> HttpRobot:
-        """The robot that looks.
+        """The robot that queries.
 
         Args:
             address: The client's.
@@ -83,7 +83,7 @@ class HttpRobots:
             connection: Over which it asks.
             world: Number of its world, or empty.
             seed: Of the episode; None: that which it began last.
-            begins: The look begins an episode.
+            begins: The query begins an episode.
 
         Raises:
             Refused: Clients without names are in the same episode, and it is none of this connection.

@@ -1,4 +1,4 @@
-"""One policy for many robots: every session is a row of the policy's batch, and looks that come close together are one.
+"""One policy for many robots: every session is a row of the policy's batch, queries that come close together are one.
 
 A policy's memory belongs to the row, so to the session: `begin` clears it with the episode's seed, and a session that
 leaves frees its row. What a session is answered does not depend on which others asked with it, as far as the policy
@@ -35,7 +35,7 @@ from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, ServedPicture
 from arena_newton.policies.protocols.packed_picture import PackedPicture
 from arena_newton.policies.protocols.picture_fit import fitted_picture
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve.message_readers import MessageReaders
 from arena_newton.robot.canonical import ACTION_WIDTH, IDENTITY_ROT6D, STATE_WIDTH
@@ -52,7 +52,7 @@ SMALL_MESSAGE = 64 * 2**10
 ABANDONED = 5.0
 """The same of a session whose connection has closed, until it asks over another one [s]."""
 WARM_UP_SEED = 0
-"""Seed of the look before the first one, which nobody is answered."""
+"""Seed of the query before the first one, which nobody is answered."""
 
 type Reason = Literal["unfit", "unknown_episode", "full", "policy", "closing"]
 """Why a request is refused: what it says, an unknown episode, no free row, the policy failed, or the server ends."""
@@ -82,26 +82,26 @@ class ServerCounts:
     """Counts of a server's work so far."""
 
     episodes: int = 0
-    looks: int = 0
-    """Looks that were answered by the policy."""
+    queries: int = 0
+    """Queries that were answered by the policy."""
     repeated: int = 0
-    """Looks that were answered from memory, because they came twice."""
+    """Queries that were answered from memory, because they came twice."""
     refused: int = 0
     act_seconds: float = 0.0
     """Time in the policy [s]."""
     batches: Counter[int] = field(default_factory=Counter)
-    """Looks in one call of the policy → number of calls."""
+    """Queries in one call of the policy → number of calls."""
     started: float = field(default_factory=time.monotonic)
-    first_look: float | None = None
-    last_look: float = 0.0
+    first_query: float | None = None
+    last_query: float = 0.0
 
     def summary(self) -> list[str]:
         """Lines for the console."""
         calls = sum(self.batches.values())
-        busy = self.last_look - (self.first_look or 0.0)
-        rate = f", {self.looks / busy:.1f} looks/s while asked" if self.looks > 1 and busy > 0 else ""
+        busy = self.last_query - (self.first_query or 0.0)
+        rate = f", {self.queries / busy:.1f} queries/s while asked" if self.queries > 1 and busy > 0 else ""
         lines = [
-            f"{self.episodes} episodes, {self.looks} looks answered, {self.repeated} repeated, "
+            f"{self.episodes} episodes, {self.queries} queries answered, {self.repeated} repeated, "
             f"{self.refused} refused{rate}"
         ]
         if calls:
@@ -131,9 +131,9 @@ class _Session:
     abandoned: bool = False
     """True if its last connection has closed."""
     last: tuple[int | None, int] | None = None
-    """Step and content of the last look."""
+    """Step and content of the last query."""
     answer: np.ndarray | None = None
-    """To the last look."""
+    """To the last query."""
 
     def follows(self, step: int) -> bool:
         """True if a query may come so many actions into the episode: at most the last chunk after the last query."""
@@ -145,17 +145,17 @@ class _Session:
 
 @dataclass
 class _Job:
-    kind: Literal["begin", "look", "end", "leave"]
+    kind: Literal["begin", "query", "end", "leave"]
     owner: str
     session: str
-    message: Begin | Look | None
+    message: Begin | Query | None
     done: Future[Answer]
     held: bool = True
     came: float = field(default_factory=time.monotonic)
 
 
 class PolicyServer:
-    """Answers the looks of many sessions by one policy, those of `max_wait` seconds in one call."""
+    """Answers the queries of many sessions by one policy, those of `max_wait` seconds in one call."""
 
     def __init__(
         self,
@@ -164,18 +164,20 @@ class PolicyServer:
         max_batch_size: int = 16,
         max_wait: float = 0.02,
         max_sessions: int = 64,
+        tracker: str = "",
         device: str | torch.device = "cpu",
     ):
         """Take the policy; `start` begins to serve.
 
         Args:
             policy: Answers by one label protocol, which `facts` declares.
-            max_batch_size: Most looks in one call of the policy.
-            max_wait: How long the first look of a batch waits for others [s].
+            max_batch_size: Most queries in one call of the policy.
+            max_wait: How long the first query of a batch waits for others [s].
             max_sessions: Rows of the policy, so most episodes at once.
+            tracker: As of `Observation`.
             device: Torch device of what the policy sees.
         """
-        self.policy, self.device = policy, torch.device(device)
+        self.policy, self.tracker, self.device = policy, tracker, torch.device(device)
         self.max_batch_size, self.max_wait, self.max_sessions = max_batch_size, max_wait, max_sessions
         self.counts = ServerCounts()
         self.protocol = protocol(policy.labels or "v3.1")
@@ -211,10 +213,10 @@ class PolicyServer:
         return self._facts
 
     def start(self, task: str = "boxing") -> None:
-        """Validate the policy, let it look once so that everything is loaded and compiled, and begin to serve.
+        """Validate the policy, query it once so that everything is loaded and compiled, and begin to serve.
 
         Args:
-            task: Of the look that nobody sees.
+            task: Of the query that nobody sees.
 
         Raises:
             InputError: The policy cannot work, or only in the process of the world.
@@ -258,16 +260,16 @@ class PolicyServer:
         """
         self._wait_for(_Job("begin", owner, begin.session, begin, Future(), held))
 
-    def look(self, owner: str, look: Look, *, held: bool = True) -> Answer:
+    def query(self, owner: str, query: Query, *, held: bool = True) -> Answer:
         """The chunk of a session, by one call of the policy for all that ask at this time.
 
-        The same look again (seed, step and content) is given the same answer again. One with `step` 0, or without a
+        The same query again (seed, step and content) is given the same answer again. One with `step` 0, or without a
         step in a session that has no episode, begins an episode.
 
         Raises:
-            Refused: The look is unfit, its episode is not known, or the policy failed.
+            Refused: The query is unfit, its episode is not known, or the policy failed.
         """
-        return self._wait_for(_Job("look", owner, look.session, self._fitted(look), Future(), held))
+        return self._wait_for(_Job("query", owner, query.session, self._fitted(query), Future(), held))
 
     def read[T](self, size: int, read: Callable[[], T]) -> T:
         """Content of a message, read in its turn; a small one is read at once.
@@ -327,14 +329,14 @@ class PolicyServer:
             raise Refused("policy", f"the policy gave no answer within {LONGEST_ACT:g} s") from None
 
     def _work(self) -> None:
-        """Take jobs in their order; looks of different sessions together."""
+        """Take jobs in their order; queries of different sessions together."""
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._closed or bool(self._jobs))
                 if self._closed:
                     break
                 job = self._jobs.popleft()
-            if job.kind != "look":
+            if job.kind != "query":
                 self._do(job)
                 continue
             self._answer(self._batch(job))
@@ -342,14 +344,14 @@ class PolicyServer:
             job.done.set_exception(Refused("closing", "the server is closing"))
 
     def _batch(self, first: _Job) -> list[_Job]:
-        """Looks that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""
+        """Queries that are answered together; what begins or ends meanwhile is done at once, unless it is theirs."""
         batch, keys = [first], {(first.owner, first.session)}
         end = first.came + self.max_wait
         while len(batch) < self.max_batch_size:
             job = self._next(keys, end)
             if job is None:
                 break
-            if job.kind == "look":
+            if job.kind == "query":
                 batch.append(job)
                 keys.add((job.owner, job.session))
             else:
@@ -435,27 +437,29 @@ class PolicyServer:
             return _Task(text, text, instruction)
         return _Task(known.name, known.gym_id, instruction or known.instruction)
 
-    def _session(self, job: _Job, look: Look, content: int) -> _Session:
-        """The session of a look; a look that begins an episode makes it."""
+    def _session(self, job: _Job, query: Query, content: int) -> _Session:
+        """The session of a query; a query that begins an episode makes it."""
         key = (job.owner, job.session)
         session = self._sessions.get(key)
         if session is not None:
-            other = look.seed is not None and look.seed != session.seed
+            other = query.seed is not None and query.seed != session.seed
             again = session.last is not None and session.last != (0, content)
-            if look.step == 0 and (other or again):
+            if query.step == 0 and (other or again):
                 session = None
             elif other:
-                raise Refused("unfit", f"the look is of seed {look.seed}, the session's episode of seed {session.seed}")
-        if look.step and (session is None or not session.follows(look.step)):
+                raise Refused(
+                    "unfit", f"the query is of seed {query.seed}, the session's episode of seed {session.seed}"
+                )
+        if query.step and (session is None or not session.follows(query.step)):
             raise Refused(
                 "unknown_episode",
-                f"the look is {look.step} actions into an episode that the server does not know (it was started again, "
-                "or the session was idle and lost its row, or began another episode); begin the episode again",
+                f"the query is {query.step} actions into an episode that the server does not know (it was started "
+                "again, or the session was idle and lost its row, or began another episode); begin the episode again",
             )
         if session is None:
-            session = self._begin(key, Begin(look.session, look.seed, look.task, look.instruction), job.held)
+            session = self._begin(key, Begin(query.session, query.seed, query.task, query.instruction), job.held)
         session.used, session.abandoned = time.monotonic(), False
-        task = self._task(look.task, look.instruction) if look.task or look.instruction else session.task
+        task = self._task(query.task, query.instruction) if query.task or query.instruction else session.task
         if task != session.task:
             if task.name != session.task.name:
                 self.policy.check_task(task.name)
@@ -463,65 +467,66 @@ class PolicyServer:
         return session
 
     def _answer(self, batch: Sequence[_Job]) -> None:
-        """Put the looks of a batch into the policy's rows, and answer them task by task."""
+        """Put the queries of a batch into the policy's rows, and answer them task by task."""
         groups: dict[_Task, list[tuple[_Job, _Session]]] = {}
         now = time.monotonic()
-        self.counts.first_look = self.counts.first_look or now
+        self.counts.first_query = self.counts.first_query or now
         for job in batch:
-            look = job.message
+            query = job.message
             try:
-                if not isinstance(look, Look):
-                    raise TypeError("no look")
-                content = zlib.crc32(look.state.tobytes(), zlib.crc32(look.instruction.encode()))
-                if look.image is not None:
-                    content = zlib.crc32(look.image.tobytes(), content)
-                session = self._session(job, look, content)
-                if look.step is not None and session.last == (look.step, content) and session.answer is not None:
+                if not isinstance(query, Query):
+                    raise TypeError("no query")
+                content = zlib.crc32(query.state.tobytes(), zlib.crc32(query.instruction.encode()))
+                if query.image is not None:
+                    content = zlib.crc32(query.image.tobytes(), content)
+                session = self._session(job, query, content)
+                if query.step is not None and session.last == (query.step, content) and session.answer is not None:
                     self.counts.repeated += 1
                     job.done.set_result(Answer(session.answer, 1000 * (time.monotonic() - job.came)))
                     continue
-                self._see(session.row, look)
-                session.last, session.answer = (look.step, content), None
+                self._see(session.row, query)
+                session.last, session.answer = (query.step, content), None
                 groups.setdefault(session.task, []).append((job, session))
             except Exception as error:
                 job.done.set_exception(self._refusal(error))
         for task, asking in groups.items():
             self._act(task, asking)
-        self.counts.last_look = time.monotonic()
+        self.counts.last_query = time.monotonic()
 
-    def _fitted(self, look: Look) -> Look:
-        """A look as the policy sees it: its picture scaled, or none. Large pictures never wait unpacked for others."""
+    def _fitted(self, query: Query) -> Query:
+        """A query as the policy sees it: its picture scaled, or none. Large pictures never wait unpacked for others."""
         if self._image is None:
-            return replace(look, image=None, packed=None)
-        picture = look.image if look.packed is None else look.packed
+            return replace(query, image=None, packed=None)
+        picture = query.image if query.packed is None else query.packed
         size = (self._camera.height, self._camera.width)
         if picture is None or isinstance(picture, np.ndarray) and picture.shape[:2] == size:
-            return look
+            return query
 
         def fit() -> np.ndarray:
             pixels = picture.unpacked() if isinstance(picture, PackedPicture) else picture
             return fitted_picture(pixels, self._camera)
 
         try:
-            return replace(look, image=self._in_turn(picture.nbytes, fit), packed=None)
+            return replace(query, image=self._in_turn(picture.nbytes, fit), packed=None)
         except Exception as error:
             raise self._refusal(error) from None
 
-    def _see(self, row: int, look: Look) -> None:
+    def _see(self, row: int, query: Query) -> None:
         """Put what a session sees into its row."""
-        if look.robot_type and look.robot_type != self.protocol.robot_type:
-            kinds = f"{plain_text(look.robot_type, 60)!r}, the policy's actions are for {self.protocol.robot_type!r}"
+        if query.robot_type and query.robot_type != self.protocol.robot_type:
+            kinds = f"{plain_text(query.robot_type, 60)!r}, the policy's actions are for {self.protocol.robot_type!r}"
             raise Refused("unfit", f"robot_type is {kinds} (label protocol {self.protocol.name})")
         if self._image is not None:
-            if look.image is None:
-                raise Refused("unfit", f"policy {self.policy.name} looks at pictures, the message holds none")
-            self._image[row] = torch.from_numpy(np.ascontiguousarray(look.image)).to(self.device)
-        self._state[row] = torch.from_numpy(look.state).to(self.device)
+            if query.image is None:
+                raise Refused("unfit", f"policy {self.policy.name} needs a picture, the message holds none")
+            self._image[row] = torch.from_numpy(np.ascontiguousarray(query.image)).to(self.device)
+        self._state[row] = torch.from_numpy(query.state).to(self.device)
 
     def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:
         mask = np.zeros(self.max_sessions, dtype=bool)
         mask[list(rows)] = True
-        return Observation(self._state, self._image, mask, task.name, task.gym_id, task.instruction)
+        said = task.name, task.gym_id, task.instruction, self.tracker
+        return Observation(self._state, self._image, mask, *said)
 
     def _act(self, task: _Task, asking: Sequence[tuple[_Job, _Session]]) -> None:
         """One call of the policy."""
@@ -539,7 +544,7 @@ class PolicyServer:
             return
         self.counts.act_seconds += time.monotonic() - began
         self.counts.batches[len(rows)] += 1
-        self.counts.looks += len(rows)
+        self.counts.queries += len(rows)
         for (job, session), made in zip(asking, chosen, strict=True):
             try:
                 if session.row in chunk.errors:

@@ -1,4 +1,4 @@
-"""The work of ``policies serve``: make the policy, open a door, report at the end."""
+"""The work of ``policies serve``: make the policy, open an endpoint, report at the end."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from arena_newton.policies.base import Policy, get
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.protocols.ports import bind, is_local
 from arena_newton.policies.remote.address import ServerAddress
-from arena_newton.policies.serve.door_guard import ACCESS_TOKEN_VARIABLE, DoorGuard
-from arena_newton.policies.serve.http_door import HttpDoor
+from arena_newton.policies.serve.connection_guard import ACCESS_TOKEN_VARIABLE, ConnectionGuard
+from arena_newton.policies.serve.http_endpoint import HttpEndpoint
 from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_options import ServeOptions
-from arena_newton.policies.serve.websocket_doors import WebsocketDoor
+from arena_newton.policies.serve.websocket_endpoint import WebsocketEndpoint
 
-__all__ = ["make_policy", "open_door", "serve_policy"]
+__all__ = ["make_policy", "open_endpoint", "serve_policy"]
 
 type Say = Callable[[str], None]
 
 USUAL_TASK = "boxing"
-"""Task of the first look, where neither the flags nor the policy ask for another."""
+"""Task of the first query, where neither the flags nor the policy ask for another."""
 
 M_MMAP_THRESHOLD, LARGE_BUFFER = -3, 2**20
 """Option of glibc's `mallopt`, and the size of buffers that get memory of their own [bytes]."""
@@ -51,7 +51,7 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         InputError: A flag is wrong, or the policy cannot be served.
     """
     say = say or (lambda line: print(line, flush=True))
-    guard = DoorGuard(options.max_sessions + SPARE_CONNECTIONS, local=is_local(options.host))
+    guard = ConnectionGuard(options.max_sessions + SPARE_CONNECTIONS, local=is_local(options.host))
     tls = _tls(options)
     if options.task is not None:
         tasks.get(options.task)
@@ -62,18 +62,19 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
         max_batch_size=options.max_batch_size,
         max_wait=options.max_wait,
         max_sessions=options.max_sessions,
+        tracker=options.tracker,
         device=device,
     )
     try:
         server.start(_first_task(policy) if options.task is None else options.task)
-        door = open_door(server, options, guard, tls)
+        endpoint = open_endpoint(server, options, guard, tls)
         try:
             with contextlib.suppress(KeyboardInterrupt):
-                for line in _greeting(server, options, guard, door.port):
+                for line in _greeting(server, options, guard, endpoint.port):
                     say(line)
                 (stop or threading.Event()).wait()
         finally:
-            door.close()
+            endpoint.close()
     finally:
         server.close()
     for line in server.counts.summary():
@@ -112,9 +113,9 @@ def make_policy(options: ServeOptions, device: torch.device) -> Policy:
     return policy
 
 
-def open_door(
-    server: PolicyServer, options: ServeOptions, guard: DoorGuard, tls: ssl.SSLContext | None = None
-) -> HttpDoor | WebsocketDoor:
+def open_endpoint(
+    server: PolicyServer, options: ServeOptions, guard: ConnectionGuard, tls: ssl.SSLContext | None = None
+) -> HttpEndpoint | WebsocketEndpoint:
     """Listen at the port of the flags.
 
     Raises:
@@ -127,9 +128,9 @@ def open_door(
         ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE_BUFFER)
     match options.protocol:
         case "arena":
-            return HttpDoor(server, listening, guard, tls)
+            return HttpEndpoint(server, listening, guard, tls)
         case "openpi" | "roboarena" | "vla-eval" as protocol:
-            return WebsocketDoor(server, listening, protocol, guard, tls)
+            return WebsocketEndpoint(server, listening, protocol, guard, tls)
     raise InputError(f"--protocol {options.protocol}: unknown")
 
 
@@ -165,7 +166,7 @@ def _tls(options: ServeOptions) -> ssl.SSLContext | None:
     return context
 
 
-def _greeting(server: PolicyServer, options: ServeOptions, guard: DoorGuard, port: int) -> list[str]:
+def _greeting(server: PolicyServer, options: ServeOptions, guard: ConnectionGuard, port: int) -> list[str]:
     """Lines for the console: the policy, its address and who may connect."""
     facts = server.facts
     kind = "http" if options.protocol == "arena" else "ws"

@@ -28,7 +28,7 @@ class ServeOptions:
     port: int = 8000
     """TCP port; 0 takes a free one and prints it."""
     max_batch_size: int = 16
-    """Most looks in one call of the policy."""
+    """Most queries in one call of the policy."""
     max_wait: float = 0.02
     """Longest wait of a batch's first query for others [s]."""
     max_sessions: int = 64
@@ -36,10 +36,12 @@ class ServeOptions:
     device: str | None = None
     """Torch device of the policy: cpu, cuda, cuda:1; the best there is when none is named."""
     task: str | None = None
-    """Task of the look before the first one, by which everything is loaded and compiled; one that the policy does when
+    """Task of the query before the first one, by which everything is loaded and compiled; one that the policy does when
     none is named."""
+    tracker: str = ""
+    """Tracker of the robots, for a policy that is given its name; unknown by default: no protocol says it."""
     replan: int | None = None
-    """Actions of a chunk that are executed before the next look, of a checkpoint; its own number by default."""
+    """Actions of a chunk that are executed before the next query, of a checkpoint; its own number by default."""
     ensemble: bool = False
     """Average the chunks that cover a tick, of a checkpoint."""
     labels: str | None = None

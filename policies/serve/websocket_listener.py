@@ -16,7 +16,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Origin
 
-from arena_newton.policies.serve.door_guard import STRANGER_SECONDS, DoorGuard
+from arena_newton.policies.serve.connection_guard import STRANGER_SECONDS, ConnectionGuard
 
 __all__ = ["WebsocketListener", "dismiss", "part"]
 
@@ -38,7 +38,7 @@ class WebsocketListener:
     def __init__(
         self,
         listening: socket.socket,
-        guard: DoorGuard,
+        guard: ConnectionGuard,
         serve_connection: Callable[[ServerConnection], None],
         answer_http: Callable[[ServerConnection, Request], Response | None],
         *,
@@ -62,7 +62,7 @@ class WebsocketListener:
         self._guard, self._serve_connection = guard, serve_connection
         self._lock = threading.Lock()
         self._open: set[ServerConnection] = set()
-        self._closed = False
+        self._closed = threading.Event()
         logger = logging.getLogger("arena_newton.websockets")
         logger.setLevel(logging.CRITICAL)  # what strangers send is no news
         self._server = serve(
@@ -85,7 +85,7 @@ class WebsocketListener:
 
     def close(self, reason: str) -> None:
         """End the port and its connections, also those of clients that do not read."""
-        self._closed = True
+        self._closed.set()
         with suppress(OSError):  # which wakes who waits for a connection
             self._server.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
@@ -99,17 +99,18 @@ class WebsocketListener:
 
         The library's own loop ends at the first connection that cannot be taken, and its threads keep the process.
         """
-        while not self._closed:
+        patience = struct.pack("ll", *divmod(round(SEND_SECONDS * 1e6), 10**6))
+        while not self._closed.is_set():
             try:
                 connection, address = self._server.socket.accept()
             except OSError:
-                time.sleep(PAUSE)
+                self._closed.wait(PAUSE)
                 continue
             if not self._guard.arrives():
                 connection.close()
                 continue
             try:
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(SEND_SECONDS), 0))
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, patience)
                 threading.Thread(target=self._handle, args=[connection, address], daemon=True).start()
             except (OSError, RuntimeError):  # it has left, or there are no more threads
                 self._guard.leaves()

@@ -28,7 +28,7 @@ from websockets.typing import Origin
 
 from arena_newton.errors import InputError
 from arena_newton.policies.protocols.ports import LOCAL, names_this_machine
-from arena_newton.policies.serve.door_guard import DoorGuard, same_token
+from arena_newton.policies.serve.connection_guard import ConnectionGuard, same_token
 from arena_newton.policies.serve.websocket_listener import WebsocketListener, part
 from arena_newton.policies.teleop.driving import Held, read_held
 
@@ -96,7 +96,7 @@ class PageServer:
         self._closed = False
         self._listener = WebsocketListener(
             listening,
-            DoorGuard(PAGES, ""),
+            ConnectionGuard(PAGES, ""),
             self._connected,
             self._answer,
             origins=[Origin(f"http://{host}") for host in hosts],

@@ -191,14 +191,14 @@ def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray |
     found = parse(CONTROLLERS, controllers) if controllers else None
     closed: list[bool | None] = []
     for side, key, raw, close in zip(SIDES, ACTION_HANDS, hands, (HAND_CLOSE_LEFT, HAND_CLOSE_RIGHT), strict=True):
-        said = _controlled(found.get(f"{side}Controller")) if isinstance(found, dict) else None
-        if said is None and raw:
+        pressed = _controlled(found.get(f"{side}Controller")) if isinstance(found, dict) else None
+        if pressed is None and raw:
             target = np.asarray(close)
-            said = bool(numbers(key, raw, len(close)) @ target > 0.5 * target @ target)
-        closed.append(said)
+            pressed = bool(numbers(key, raw, len(close)) @ target > 0.5 * target @ target)
+        closed.append(pressed)
     if closed == [None, None]:
         return None
-    return np.array([bool(said) for said in closed], dtype=np.float32)
+    return np.array([bool(pressed) for pressed in closed], dtype=np.float32)
 
 
 def _controlled(controller: object) -> bool | None:

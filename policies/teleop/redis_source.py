@@ -92,7 +92,7 @@ class RedisSource:
         self.client, self.reference = client, reference
         self.backend = keys.BACKENDS[reference.backend]
         self._clock, self._say = clock, say
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._begun = False
         self._stamps: tuple[float | None, float | None] = (None, None)
         self._frame: np.ndarray | None = None
@@ -261,8 +261,8 @@ class RedisSource:
     def _tell(self, line: str) -> None:
         """Say each kind of line once: numbers in it do not make it another kind."""
         kind = "".join(c for c in line if not c.isdigit())
-        if kind not in self._said and len(self._said) < MOST_LINES:
-            self._said.add(kind)
+        if kind not in self._reported and len(self._reported) < MOST_LINES:
+            self._reported.add(kind)
             self._say(f"Redis: {line}")
 
 

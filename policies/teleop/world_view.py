@@ -25,7 +25,7 @@ from arena_newton.errors import InputError
 from arena_newton.pictures.camera import CAMERA_PRIMS
 from arena_newton.pictures.follow import WALL_GAP, room_walls
 from arena_newton.policies.protocols.ports import LOCAL, bind, names_this_machine
-from arena_newton.policies.serve.door_guard import same_token
+from arena_newton.policies.serve.connection_guard import same_token
 from arena_newton.policies.teleop.driving import CAMERAS
 from arena_newton.robot.g1 import TICK
 from arena_newton.robot.rotations import heading_np

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -18,7 +18,13 @@ import torch
 from arena_newton.errors import ArenaError
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import TrainableModel
-from arena_newton.policies.train.frames.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.frames.batching import (
+    UNKNOWN_FRACTION,
+    BalancedOrder,
+    BatchMaker,
+    RowOrder,
+    step_seed,
+)
 from arena_newton.policies.train.network_compiler import compile_networks, compiler_errors, uncompiled
 
 __all__ = ["PolicyTrainer"]
@@ -41,6 +47,7 @@ class PolicyTrainer:
         batches: BatchMaker,
         recipe: TrainingRecipe,
         *,
+        weights: Sequence[float] | None = None,
         graph: bool = True,
         compiled: bool = False,
         rank: int = 0,
@@ -52,6 +59,7 @@ class PolicyTrainer:
             model: The family's network; its policy is put into training mode.
             batches: Where batches come from.
             recipe: Settings; `steps` is the end of the schedule.
+            weights: Of each pair of task and tracker in the draw of the samples; None: every picture counts alike.
             graph: On CUDA: capture a step in a graph, where the model can be captured.
             compiled: Compile the networks, at the first step.
             rank: Number of this process.
@@ -59,7 +67,7 @@ class PolicyTrainer:
 
         Raises:
             InputError: The family cannot be compiled.
-            ArenaError: No episode is long enough.
+            ArenaError: No episode is long enough, or none of a pair.
         """
         self.model, self.batches, self.recipe = model, batches, recipe
         self.rank, self.ranks = rank, ranks
@@ -75,7 +83,12 @@ class PolicyTrainer:
         """Those of held-out episodes."""
         if not len(self.samples):
             raise ArenaError(f"no episode is longer than the {drop} rows at its end at which no sample begins")
-        self._order = RowOrder(self.samples, recipe.seed, self.device)
+        self._order = self._ordered(weights)
+        names = store.pair_names
+        self._sums = torch.zeros((len(names), 2), device=self.device) if len(names) > 1 else None
+        """Of each pair since the last reading: losses of its samples, and their number."""
+        self.drawn = dict.fromkeys(names if len(names) > 1 else (), 0)
+        """Pair → samples of this process, since the training began or went on, up to the last reading."""
         self._rows = torch.zeros(recipe.batch_size, dtype=torch.int64, device=self.device)
         self._loss = torch.zeros((), device=self.device)
         self._norm = torch.zeros((), device=self.device)
@@ -95,6 +108,16 @@ class PolicyTrainer:
         if ranks > 1:
             for tensor in model.policy.state_dict().values():
                 torch.distributed.broadcast(tensor, 0)
+
+    def _ordered(self, weights: Sequence[float] | None) -> RowOrder | BalancedOrder:
+        if weights is None:
+            return RowOrder(self.samples, self.recipe.seed, self.device)
+        store = self.batches.store
+        pairs = store.pair.cpu().numpy()[self.samples]
+        for name, count in zip(store.pair_names, np.bincount(pairs, minlength=len(weights)), strict=True):
+            if not count:
+                raise ArenaError(f"--balance task: no episode of {name} is trained on that is long enough")
+        return BalancedOrder(self.samples, pairs, weights, self.recipe.seed, self.device)
 
     @property
     def loss(self) -> torch.Tensor:
@@ -158,12 +181,18 @@ class PolicyTrainer:
         """Batch, loss and gradient."""
         recipe = self.recipe
         batch = self.batches(
-            self._rows, shift=recipe.shift_px, colour=recipe.colour, transforms=recipe.image_transforms
+            self._rows,
+            looks=True,
+            shift=recipe.shift_px,
+            colour=recipe.colour,
+            transforms=recipe.image_transforms,
+            unknown=UNKNOWN_FRACTION,
         )
         # LeRobot makes some constants on the host and copies them, which no graph can hold; here they are made on the
         # device.
         with self.device if self.graphed else contextlib.nullcontext(), self._precision():
-            loss = self.model.loss(batch, self.model.noise(len(self._rows)))
+            loss, each = self.model.losses(batch, self.model.noise(len(self._rows)))
+        self._add(self._sums, self._rows, each)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self._loss.copy_(loss.detach())
@@ -174,6 +203,25 @@ class PolicyTrainer:
                 self._flat = torch.cat(gradients)
             else:
                 torch.cat(gradients, out=self._flat)
+
+    def _add(self, sums: torch.Tensor | None, rows: torch.Tensor, losses: torch.Tensor) -> None:
+        """Add the losses of samples to those of their pairs."""
+        if sums is not None:
+            pairs = self.batches.store.pair[rows]
+            sums.index_add_(0, pairs, torch.stack([losses.float(), torch.ones_like(losses.float())], dim=1))
+
+    def pair_losses(self) -> dict[str, float]:
+        """Mean loss of each pair's samples of this process since the last call; waits for the device.
+
+        Of a training with several pairs of task and tracker; a pair of which none was drawn is left out.
+        """
+        if self._sums is None:
+            return {}
+        found = dict(zip(self.drawn, self._sums.tolist(), strict=True))
+        self._sums.zero_()
+        for name, (_, count) in found.items():
+            self.drawn[name] += int(count)
+        return {name: total / count for name, (total, count) in found.items() if count}
 
     def _whole(self) -> None:
         """A step of a single process."""
@@ -219,6 +267,8 @@ class PolicyTrainer:
             for name, tensor in self.model.policy.state_dict().items():
                 tensor.copy_(before[name])
         _restore_moments(self.optimizer, moments)
+        if self._sums is not None:
+            self._sums.zero_()
         self.optimizer.zero_grad(set_to_none=True)
         parts: list[Callable[[], None]] = [self._descend, self._update] if self.ranks > 1 else [self._whole]
         pool = torch.cuda.graph_pool_handle()
@@ -251,24 +301,31 @@ class PolicyTrainer:
             raise ArenaError(f"the {self.ranks} processes hold different weights at step {self.step}")
 
     @torch.no_grad()
-    def held_out_loss(self) -> float:
+    def held_out_losses(self) -> tuple[float, dict[str, float]]:
         """Mean loss of held-out rows spread over their episodes, without augmentation; NaN where none are held out.
 
         The same rows and noise each time, so that values of different steps differ by the network alone.
+
+        Returns:
+            That of all rows, and that of each pair, as of `pair_losses`.
         """
         if not len(self.held):
-            return float("nan")
+            return float("nan"), {}
         size = min(self.recipe.batch_size, len(self.held))
         count = min(HELD_BATCHES, len(self.held) // size)
         chosen = self.held[np.linspace(0, len(self.held) - 1, count * size).round().astype(np.int64)]
         rows = torch.from_numpy(chosen).to(self.device)
         total = torch.zeros((), device=self.device)
+        sums = None if self._sums is None else torch.zeros_like(self._sums)
         with _evaluating(self.model), uncompiled() if self._compiled else contextlib.nullcontext():
             torch.manual_seed(step_seed(self.recipe.seed, -1))
             for part in rows.split(size):
                 with self._precision():
-                    total += self.model.loss(self.batches(part), self.model.noise(size)).float()
-        return float(total / count)
+                    loss, each = self.model.losses(self.batches(part), self.model.noise(size))
+                total += loss.float()
+                self._add(sums, part, each)
+        found = zip(self.drawn, [] if sums is None else sums.tolist(), strict=True)
+        return float(total / count), {name: all_of / number for name, (all_of, number) in found if number}
 
 
 @contextlib.contextmanager

@@ -6,11 +6,15 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
 from arena_newton.cli.flags import flag_name
 from arena_newton.errors import InputError
+from arena_newton.policies.lerobot.checkpoint_facts import FACTS_FILE, CheckpointFacts
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 
-__all__ = ["plain", "plain_options", "read_options", "resumed"]
+__all__ = ["plain", "plain_options", "read_options", "resumed", "stored_recipe"]
 
 FREE_ON_RESUME = frozenset(
     ("resume", "out", "dataset", "steps", "minutes", "device", "save_every", "keep", "hold_out_every", "log_every")
@@ -65,13 +69,13 @@ def read_options(content: Mapping[str, object], where: Path) -> PolicyTrainOptio
     Raises:
         InputError: They are damaged.
     """
-    values: dict[str, object] = {}
+    values: dict[str, object] = {"tracker_vector": False}  # as it was before there was the flag
     for one in dataclasses.fields(PolicyTrainOptions):
         if one.name not in content:
             continue
         value, default = content[one.name], one.default
-        if one.name == "dataset" and isinstance(value, list) and all(isinstance(name, str) for name in value):
-            values[one.name] = tuple(Path(name) for name in value)
+        if isinstance(default, tuple) and isinstance(value, list) and all(isinstance(name, str) for name in value):
+            values[one.name] = tuple(Path(name) if one.name == "dataset" else name for name in value)
         elif one.name in ("out", "resume"):
             continue
         elif type(value) is type(default) or (isinstance(default, float) and type(value) is int):
@@ -81,6 +85,24 @@ def read_options(content: Mapping[str, object], where: Path) -> PolicyTrainOptio
         else:
             raise InputError(f"{where}: options: {one.name} is {str(value)[:60]!r}, which it cannot be")
     return PolicyTrainOptions(**values)  # type: ignore[arg-type]  # each is of its default's kind
+
+
+def stored_recipe(checkpoint: Path) -> TrainingRecipe:
+    """The recipe with which a training began; one of that name may be another one today.
+
+    Raises:
+        InputError: The checkpoint does not hold it.
+    """
+    folder = checkpoint / PRETRAINED_MODEL_DIR
+    facts = CheckpointFacts.read(folder)
+    content = facts.options.get("recipe") if facts else None
+    try:
+        assert isinstance(content, dict)
+        return TrainingRecipe(**content | {"betas": tuple(content["betas"])})
+    except (AssertionError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder / FACTS_FILE}: options: recipe is not that of a training ({type(error).__name__})"
+        ) from None
 
 
 def plain(value: object) -> object:

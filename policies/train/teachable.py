@@ -109,7 +109,7 @@ def teachable(options: TeachableOptions) -> int:
     )
     began, losses = time.perf_counter(), [0.0]
 
-    def said(step: int, loss: float) -> None:
+    def report(step: int, loss: float) -> None:
         losses.append(loss)
         if step % SAID_EVERY == 0 or step == options.steps - 1:
             spent = time.perf_counter() - began
@@ -121,7 +121,7 @@ def teachable(options: TeachableOptions) -> int:
         steps=options.steps,
         batch_size=options.batch_size,
         seed=options.seed,
-        on_step=said,
+        on_step=report,
     )
     trained = time.perf_counter() - began
     quiet_warp()

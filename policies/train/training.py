@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,18 +17,19 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import counted
-from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
+from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, vector_of
 from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe, with_pretrained
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.families.policy_model import TrainableModel
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
 from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_fractions, task_weights
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.stored_flags import plain, plain_options, resumed
+from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
 from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
 
@@ -71,7 +73,7 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
             if not quiet:
                 print(f"finished already, after {counted(progress.step, 'step')}: {checkpoint / PRETRAINED_MODEL_DIR}")
             return checkpoint / PRETRAINED_MODEL_DIR
-    settings = chosen_recipe(options)
+    settings = chosen_recipe(options) if checkpoint is None else stored_recipe(checkpoint)
     out = options.out or default_folder(options)
     if options.resume is None:
         check_new(out)
@@ -80,9 +82,9 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
         with _group(device, processes), fast_kernels(device):
             return _train(options, settings, out, device, processes, progress, checkpoint)
     except torch.OutOfMemoryError as error:
-        told = " ".join(str(error).split())[:160]
+        text = " ".join(str(error).split())[:160]
         raise ArenaError(
-            f"{device}: its memory is full ({told}); try a smaller --batch-size, or fewer datasets"
+            f"{device}: its memory is full ({text}); try a smaller --batch-size, or fewer datasets"
         ) from None
 
 
@@ -106,17 +108,21 @@ def _train(
         _check_same_data(datasets, progress)
     check_pictures(datasets, settings)
     began = time.monotonic()
-    total = sum(dataset.frames for dataset in datasets)
+    every = options.picture_every
+    total = sum(-(-episode.length // every) for dataset in datasets for episode in dataset.episodes)
     with tqdm(total=total, unit="picture", desc="decoding", disable=None if speaks else True, leave=False) as bar:
         jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
         network = network_bytes(settings, device)
         store = load_frames(
-            datasets, device, hold_out=options.hold_out, jobs=jobs, network=network, on_frames=bar.update
+            datasets, device, hold_out=options.hold_out, every=every, jobs=jobs, network=network, on_frames=bar.update
         )
+    if options.looks:
+        looks = load_looks(datasets, store, *look_fractions(options.looks), jobs=jobs, network=network)
+        store = dataclasses.replace(store, looks=looks)
     if speaks:
         size = store.pictures.numel() / 1e9
         print(
-            f"{counted(len(store.lengths), 'episode')} ({sum(store.held)} held out), {store.rows} pictures, "
+            f"{counted(len(store.lengths), 'episode')} ({sum(store.held)} held out), {len(store.pictures)} pictures, "
             f"{size:.2f} GB on {device} in {time.monotonic() - began:.1f} s",
             flush=True,
         )
@@ -125,17 +131,22 @@ def _train(
         key: {name: torch.from_numpy(np.array(value)) for name, value in of.items()}
         for key, of in statistics(datasets, trained, settings.labels).items()
     }
+    if settings.cut_pad and camera_fit(store) != "pad":
+        settings = dataclasses.replace(settings, cut_pad=False)
     vector = task_vector(store, settings)
+    trackers = tracker_vector(store) if vector and options.tracker_vector else ()
     if vector:
-        ones, zeros = torch.ones(len(vector)), torch.zeros(len(vector))
+        ones = torch.ones(len(vector_of(vector, trackers, "", "")))
+        zeros = torch.zeros_like(ones)
         stats[VECTOR_KEY] = {"mean": zeros, "std": ones, "min": zeros, "max": ones, "q01": zeros, "q99": ones}
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
-    batches = make_batches(model, store, vector)
+    batches = make_batches(model, store, vector, trackers)
     trainer = PolicyTrainer(
         model,
         batches,
         settings,
+        weights=pair_weights(store, options),
         graph=options.graph,
         compiled=options.compile,
         rank=processes.rank,
@@ -150,10 +161,9 @@ def _train(
     facts = CheckpointFacts(
         labels=settings.labels,
         realign=settings.realign,
-        width=store.width,
-        height=store.height,
         fit=camera_fit(store),
         task_vector=vector,
+        tracker_vector=trackers,
         family=settings.family,
         recipe=settings.name,
         tasks=tuple(task for task in store.tasks if task),
@@ -192,8 +202,10 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
     return recipe(options.policy, options.recipe, **changes)
 
 
-def make_batches(model: TrainableModel, store: FrameStore, vector: tuple[str, ...] = ()) -> BatchMaker:
-    """Batches of a store as a model takes them; prompts are turned into tokens once."""
+def make_batches(
+    model: TrainableModel, store: FrameStore, vector: tuple[str, ...] = (), trackers: tuple[str, ...] = ()
+) -> BatchMaker:
+    """Batches of a store as a model takes them, with a vector of tasks and trackers; prompts become tokens once."""
     tokens: dict[str, torch.Tensor] = {}
     per_row = model.reads_task and model.recipe.family == "pi05"  # its prompt holds the state
     if per_row:
@@ -206,7 +218,8 @@ def make_batches(model: TrainableModel, store: FrameStore, vector: tuple[str, ..
     elif model.reads_task:
         tokens = model.tokens(store.instructions)
     placed = {key: value.to(store.device) for key, value in tokens.items()}
-    return BatchMaker(store, model.normalise, model.samples, vector, placed, per_row)
+    tall = model.recipe.height
+    return BatchMaker(store, model.normalise, model.samples, vector, trackers, tall, placed, per_row)
 
 
 def task_vector(store: FrameStore, settings: TrainingRecipe) -> tuple[str, ...]:
@@ -222,7 +235,30 @@ def task_vector(store: FrameStore, settings: TrainingRecipe) -> tuple[str, ...]:
     return store.tasks
 
 
-def camera_fit(store: FrameStore) -> str:
+def tracker_vector(store: FrameStore) -> tuple[str, ...]:
+    """Trackers that the vector names; none where all episodes have the same."""
+    trackers = sorted({tracker for _, tracker in store.pairs})
+    return tuple(filter(None, trackers)) if len(trackers) > 1 else ()
+
+
+def pair_weights(store: FrameStore, options: PolicyTrainOptions) -> list[float] | None:
+    """Weight of each pair of task and tracker in the draw of the samples; None where every picture counts alike.
+
+    Raises:
+        InputError: A task that is weighed is none of the datasets', or these do not say what an episode's task is.
+    """
+    if options.balance != "task":
+        return None
+    if "" in store.tasks:
+        raise InputError("--balance task: an episode's dataset does not say which task it is of")
+    weights = task_weights(options.task_weights)
+    for task in weights:
+        if task not in store.tasks:
+            raise InputError(f"--task-weights {task}: the datasets have {', '.join(store.tasks)}")
+    return [weights.get(task, 1.0) for task, _ in store.pairs]
+
+
+def camera_fit(store: FrameStore) -> Literal["pad", "native"]:
     """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
     band = (store.height - store.width * 3 // 4) // 2
     return "pad" if band > 0 and min(store.top, store.bottom) >= BLACK_PART * band else "native"

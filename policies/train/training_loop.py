@@ -91,6 +91,7 @@ class TrainingLoop:
         self._stopped = False
         self._measured_from: tuple[int, float] | None = None
         self._last: Path | None = None
+        self._last_row: dict[str, float] = {}
 
     @property
     def minutes(self) -> float:
@@ -116,7 +117,8 @@ class TrainingLoop:
         options, trainer, first = self._options, self._trainer, self._processes.first
         if first:
             remove_older(self._out, 0)
-        log = TrainingLog(self._out, step=trainer.step, quiet=options.quiet) if first else None
+        pairs = tuple(trainer.drawn)
+        log = TrainingLog(self._out, step=trainer.step, quiet=options.quiet, pairs=pairs) if first else None
         begin = trainer.step
         self._started = time.monotonic()
         try:
@@ -148,6 +150,8 @@ class TrainingLoop:
                 )
             raise KeyboardInterrupt
         if first and not options.quiet:
+            for line in self._pair_lines():
+                print(line)
             print(f"{counted(trainer.step, 'step')} in {self.minutes:.1f} min; wrote {last / PRETRAINED_MODEL_DIR}")
         return last
 
@@ -211,10 +215,26 @@ class TrainingLoop:
             "gradient_norm": float(trainer.gradient_norm),
             "steps_per_s": (trainer.step - row_at[0]) / max(now - row_at[1], 1e-9),
         }
+        row |= {f"loss_{pair}": value for pair, value in trainer.pair_losses().items()}
         if held and len(trainer.held):
-            row["held_out_loss"] = trainer.held_out_loss()
+            row["held_out_loss"], of_pairs = trainer.held_out_losses()
+            row |= {f"held_out_loss_{pair}": value for pair, value in of_pairs.items()}
         log.record(row)
+        self._last_row = row
         return trainer.step, time.monotonic()
+
+    def _pair_lines(self) -> list[str]:
+        """Each pair of task and tracker: its fraction of the samples, and its losses in the last row of the log."""
+        drawn, row = self._trainer.drawn, self._last_row
+        total, lines = max(1, sum(drawn.values())), []
+        for pair, count in drawn.items():
+            losses = [
+                f"{words} {row[name]:.4f}"
+                for words, name in (("loss", f"loss_{pair}"), ("held out", f"held_out_loss_{pair}"))
+                if name in row
+            ]
+            lines.append(", ".join([f"{pair}: {100 * count / total:.1f} % of the samples", *losses]))
+        return lines
 
     def _save(self) -> Path:
         """Write a checkpoint of this step; only the first process does, once all hold the same."""

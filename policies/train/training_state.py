@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from lerobot.utils.constants import (
@@ -31,6 +32,7 @@ from safetensors.torch import load_file, save_file
 
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import PARTIAL, replace_atomically
+from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 
@@ -56,20 +58,25 @@ FEWEST_DIGITS = 6
 BATCH_COUNTER = "num_batches_tracked"
 """Buffer of a batch normalization that checkpoints leave out; with a fixed momentum nothing reads it."""
 
+MOST_BYTES = 64 << 20
+"""Largest file that is read."""
+FROM_0 = Fit("an integer of at least 0", lambda value: 0 <= value < 2**40)
+FROM_1 = Fit("an integer of at least 1", lambda value: 1 <= value < 2**40)
+
 
 @dataclass(frozen=True)
 class TrainingProgress:
     """Progress of a training, and its identity."""
 
-    step: int
+    step: Annotated[int, FROM_0]
     """Steps that are done."""
-    steps: int
+    steps: Annotated[int, FROM_0]
     """Steps at which the schedule ends; 0 while --minutes has not fixed them."""
-    minutes: float
+    minutes: Annotated[float, Fit("a time", lambda value: 0.0 <= value < 1e9)]
     """Time of the optimization so far [min]."""
-    processes: int
+    processes: Annotated[int, FROM_1]
     """Processes that trained."""
-    batch_size: int
+    batch_size: Annotated[int, FROM_1]
     """Samples of a step, of each process."""
     options: Mapping[str, object] = field(default_factory=dict)
     """Flags by the names of `PolicyTrainOptions`."""
@@ -84,27 +91,9 @@ class TrainingProgress:
             InputError: The file is absent or damaged.
         """
         path = folder / TRAINING_STATE_DIR / PROGRESS_FILE
-        try:
-            content = json.loads(path.read_bytes())
-        except FileNotFoundError:
-            raise InputError(f"{path}: is missing; the checkpoint is of no training that can go on") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{path}: not readable as JSON ({type(error).__name__})") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise InputError(f"{path}: expected an object with format {FORMAT}")
-        for name, least in (("step", 0), ("steps", 0), ("processes", 1), ("batch_size", 1)):
-            value = content.get(name)
-            if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 2**40:
-                raise InputError(f"{path}: {name} is {str(value)[:60]!r}, expected an integer of at least {least}")
-        minutes, options, datasets = (content.get(name) for name in ("minutes", "options", "datasets"))
-        if not isinstance(minutes, int | float) or isinstance(minutes, bool) or not 0.0 <= minutes < 1e9:
-            raise InputError(f"{path}: minutes is {str(minutes)[:60]!r}, expected a time")
-        if not isinstance(options, dict):
-            raise InputError(f"{path}: options is no object")
-        if not isinstance(datasets, list) or not all(isinstance(one, dict) for one in datasets):
-            raise InputError(f"{path}: datasets is no list of objects")
-        numbers = [int(content[name]) for name in ("step", "steps", "processes", "batch_size")]
-        return cls(numbers[0], numbers[1], float(minutes), numbers[2], numbers[3], options, tuple(datasets))
+        if not path.is_file():
+            raise InputError(f"{path}: is missing; the checkpoint is of no training that can go on")
+        return loaded(str(path), read_object(path, MOST_BYTES, FORMAT), cls)
 
     def write(self, folder: Path) -> None:
         """Write the file of a checkpoint."""

@@ -30,12 +30,12 @@ over "World"
 
 @dataclasses.dataclass(frozen=True)
 class Ringing(rule_types.SuccessRule):
-    """How often the bell must ring."""
+    """Number of rings that success takes."""
 
     times: int = 3
 
     def sentence(self):
-        """What it takes."""
+        """Condition in words."""
         return f"the bell rings {self.times} times"
 
 

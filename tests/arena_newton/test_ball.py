@@ -15,7 +15,7 @@ from arena_newton.robot.g1 import PhysicsRate
 HEIGHTS = np.array([0.3, 1.0, 3.0])
 """[m]."""
 PHASES = np.array([0.05, 0.35, 0.65, 0.95])
-"""Where within a physics step the ball meets the ground."""
+"""Fractions of a physics step at which the ball meets the ground."""
 RADIUS, GRAVITY = 0.11, 9.81
 RATES = {0.001: PhysicsRate(0.001, 1), 0.005: PhysicsRate(0.005, 1)}
 

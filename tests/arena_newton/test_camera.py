@@ -149,7 +149,7 @@ def test_samples_smooth_edges(model):
 
 
 def test_drawing_agrees_with_ray_tracing(model):
-    """What the CPU draws is what Newton's ray tracer sees: albedo, normal and depth, but for silhouettes."""
+    """The CPU draws what Newton's ray tracer sees: albedo, normal and depth, but for silhouettes."""
     camera = _camera(model, WorldLights.allocate(WORLDS, "cpu"), 160, 120)
     surfaces = (camera.buffers.depth, camera.buffers.normals, camera.buffers.albedo)
     camera.render(model.state())

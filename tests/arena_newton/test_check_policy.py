@@ -290,7 +290,7 @@ def test_experts_conform_in_real_worlds():
 
 
 def test_a_policy_in_real_worlds_that_averages_is_found():
-    """What is found in made-up worlds is found in real ones too."""
+    """Faults that made-up worlds find are found in real ones too."""
 
     def make_worlds(worlds):
         return ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=worlds, engine="mujoco", rules="released")
@@ -300,6 +300,6 @@ def test_a_policy_in_real_worlds_that_averages_is_found():
 
 
 def test_a_policy_that_cannot_do_the_task_says_so():
-    """What the policy itself refuses, such as a task without an expert, is its own error and no finding."""
+    """A policy's own refusal, such as of a task without an expert, is its own error and no finding."""
     with pytest.raises(InputError, match="nothing"):
         check_policy(policies.get("expert"), task="nothing")

@@ -1,4 +1,4 @@
-"""What the documentation shows runs, and what it names exists."""
+"""The documentation's examples run, and the names in it exist."""
 
 import re
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_the_world_from_python():
     observation, env = world["observation"], world["env"]
     assert observation.state.shape == (2, 64) and observation.image.shape == (2, 64, 64, 3)
     assert observation.image.dtype == torch.uint8 and observation.image.float().std() > 5.0
-    assert observation.instruction == "Kick the soccer ball into the goal."
+    assert observation.instruction == "Kick the soccer ball into the goal." and observation.tracker == "twist2"
     assert world["picture"].shape == (2, 64, 64, 3) and world["picture"].float().std() > 5.0
     assert [(r.episode.episode_seed, r.outcome, r.steps) for r in world["results"]] == [
         (seed, "timeout", 8) for seed in (1, 2, 3)

@@ -46,7 +46,7 @@ def test_every_extra_is_reported(monkeypatch):
 
 
 def test_a_missing_extra_is_a_note(monkeypatch):
-    """What is not installed is named with the command that installs it; a bare evaluation runs without."""
+    """A missing library is named with the command that installs it; a bare evaluation runs without."""
     monkeypatch.setattr(doctor, "faults", lambda *_, **__: [None])
     monkeypatch.setitem(extras.EXTRAS, "data", ("json", "no_such_module"))
     finding = found(doctor.examine_extras(), "extra [data]")
@@ -131,7 +131,7 @@ def test_a_policy_by_name(capsys):
     ],
 )
 def test_bad_input_is_one_line(arguments, said, capsys):
-    """What cannot be examined is named in one line with exit code 2."""
+    """Names that cannot be examined are one line with exit code 2."""
     assert main(arguments.split()) == 2
     error = capsys.readouterr().err
     assert said in error and error.startswith("error: ") and error.count("\n") == 1

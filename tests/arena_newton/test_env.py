@@ -41,7 +41,7 @@ def test_startup_gives_no_success(won):
 
 
 def test_statuses_are_kept(env):
-    """What a step returned does not change with the next step."""
+    """Statuses that a step returned do not change with the next step."""
     env.reset([1, 2])
     action = torch.from_numpy(STAND_ACTION).repeat(2, 1)
     for _ in range(env.startup_ticks):

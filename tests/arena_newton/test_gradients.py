@@ -111,7 +111,7 @@ def test_a_rolled_ball_goes_where_the_engines_goes(pitch, velocity, apart):
 
 
 def test_a_landing_does_not_move_with_the_vertical_speed():
-    """What the documentation warns of, with its numbers: behind a bounce one gradient is wrong."""
+    """Behind a bounce one gradient is wrong, as the documentation warns with its numbers."""
     velocity = torch.tensor([0.0, 5.0, 2.0], requires_grad=True)
     end = flown(velocity, 50)[-1, 1]
     (grad,) = torch.autograd.grad(end, velocity)
@@ -162,7 +162,7 @@ def test_differences_of_a_known_function():
 
 
 def test_a_kink_tells_itself():
-    """Where the slope changes within the step, `bend` is as large as the gradient's error; elsewhere it is zero."""
+    """`bend` is as large as the gradient's error if the slope changes within the step; elsewhere it is zero."""
     found = central_differences(lambda points: points.abs().sum(1), torch.tensor([0.0, 1.0]), 0.1, rows=5)
     torch.testing.assert_close(found.gradient, torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(found.bend, torch.tensor([1.0, 0.0]), atol=1e-6, rtol=0.0)
@@ -171,7 +171,7 @@ def test_a_kink_tells_itself():
 
 
 def test_the_estimate_is_the_exact_gradient_where_both_exist():
-    """Where the reference ends after some ticks of the closed loop: differences agree with the kernels' gradient."""
+    """Differences of the reference's end after some ticks of the closed loop agree with the kernels' gradient."""
     env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=5, engine="mujoco", device="cpu", fast_physics=True)
     stand = torch.tensor(canonical.STAND_ACTION)
     names = torch.tensor([0, 1, 5, 7])  # both displacements, and where the rotation's first column points

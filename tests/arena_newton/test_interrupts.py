@@ -9,7 +9,7 @@ from arena_newton.files.interrupts import Uninterrupted
 
 
 def test_a_signal_waits_for_the_end_of_the_block():
-    """What was begun is done, then the interrupt comes, and the handler is the one from before."""
+    """A block that was begun is done, then the interrupt comes, and the handler is the one from before."""
     before, done, whole = signal.getsignal(signal.SIGINT), [], Uninterrupted()
     with pytest.raises(KeyboardInterrupt), whole, whole:
         signal.raise_signal(signal.SIGINT)
@@ -21,7 +21,7 @@ def test_a_signal_waits_for_the_end_of_the_block():
 
 
 def test_a_second_signal_comes_at_once():
-    """Who presses Ctrl-C twice does not wait for a block that hangs."""
+    """A second Ctrl-C does not wait for a block that hangs."""
     done, whole = [], Uninterrupted()
     with pytest.raises(KeyboardInterrupt), whole:
         signal.raise_signal(signal.SIGINT)

@@ -19,15 +19,14 @@ SCRIPT = Path(sys.executable).with_name("arena-newton")
 
 
 def test_every_program_of_the_package_has_a_command():
-    """What `python -m` runs has a command; builders, examples, processes of commands and front doors aside."""
+    """Modules that `python -m` runs have a command; builders, examples, processes of commands and front doors aside."""
     doors = {
         "arena_newton/__main__.py",
         "arena_newton/files/sandboxed_load.py",
-        "arena_newton/data/recording/film_process.py",
+        "arena_newton/data/recording/encoder_process.py",
         "eval/workers/local_backend.py",
         "policies/train/frames/decoder_process.py",
         "trackers/__main__.py",
-        "usd_scenes/g1/build.py",
     }
     programs = set()
     for folder in ("arena_newton", "kernels", "trackers", "policies", "eval", "usd_scenes"):

@@ -13,9 +13,9 @@ from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.statistics import stats
 from arena_newton.usd_scenes.__main__ import main as scenes_main
-from arena_newton.usd_scenes.build import parts
 from arena_newton.usd_scenes.skeleton import write
 from arena_newton.usd_scenes.validate import task_of, validate
+from scene_builders.__main__ import parts
 
 
 def test_a_registered_task_is_listed_and_judged_by_its_rules(bell, capsys):

@@ -8,7 +8,7 @@ from arena_newton.files.own_processes import environment
 
 
 def test_a_process_finds_this_package(tmp_path, monkeypatch):
-    """Where another version is installed too, a process imports the one that started it, from any folder."""
+    """A process imports the version that started it, from any folder, though another one is installed too."""
     other = tmp_path / "arena_newton"
     other.mkdir()
     (other / "__init__.py").write_text("")

@@ -359,27 +359,27 @@ def test_predicates_carry_their_first_ticks(monkeypatch):
 
 
 class Dated(Policy):
-    """Chunks of six actions whose forward step names the tick of the look: look t gives t/1000 + action/100000 m."""
+    """Chunks of six actions whose forward step names the tick of the query: query t gives t/1000 + action/100000 m."""
 
     name = "dated"
     length = 6
 
     def __init__(self):
-        self.looks = []
+        self.queries = []
 
     def attach(self, env):
         self.env = env
 
     def act(self, observation):
         worlds = len(observation.state)
-        self.looks.append((self.env.tick.copy(), observation.mask.copy()))
+        self.queries.append((self.env.tick.copy(), observation.mask.copy()))
         actions = torch.from_numpy(STAND_ACTION).repeat(worlds, self.length, 1)
         actions[:, :, 0] = torch.from_numpy(self.env.tick)[:, None] / 1e3 + torch.arange(self.length) / 1e5
-        return Chunk(actions, phases=[f"look {tick}" for tick in self.env.tick])
+        return Chunk(actions, phases=[f"query {tick}" for tick in self.env.tick])
 
 
 def test_a_policy_reads_the_world_and_writes_nothing(env):
-    """What `attach` gives shows positions of this tick; writing is an error, or moves nothing."""
+    """The view that `attach` gives shows positions of this tick; writing is an error, or moves nothing."""
     seen = []
 
     class Meddling(Sway):
@@ -421,15 +421,15 @@ class Executed(Recorder):
 
 
 @pytest.mark.parametrize("latency", [0, 1, 4, 5])
-def test_a_chunk_begins_so_many_ticks_after_its_look(env, latency):
+def test_a_chunk_begins_so_many_ticks_after_its_query(env, latency):
     """The robot stands first; then chunk follows chunk, whole, each looked at `latency` ticks before it begins."""
     policy, seen = Dated(), Executed()
     results = Rollout(env, policy, _episodes(2), recorder=seen, max_steps=20, latency=latency).run()
-    chunks = [100 * look + action for look in (0, 6, 12, 18) for action in range(6)]
+    chunks = [100 * query + action for query in (0, 6, 12, 18) for action in range(6)]
     assert [r.steps for r in results] == [20, 20]
     assert seen.steps[0] == seen.steps[1] == ([0] * latency + chunks)[:20]
-    assert [ticks[0] for ticks, _ in policy.looks] == [0, 6, 12, 18]
-    begun = [(f"look {look}", look + latency) for look in (0, 6, 12, 18) if look + latency < 20]
+    assert [ticks[0] for ticks, _ in policy.queries] == [0, 6, 12, 18]
+    begun = [(f"query {query}", query + latency) for query in (0, 6, 12, 18) if query + latency < 20]
     assert list(results[0].phases) == begun
 
 
@@ -476,11 +476,11 @@ class Pieces(Dated):
         whole, asking = super().act(observation), np.flatnonzero(observation.mask).tolist()
         for world in asking:
             self.memory.glimpse(world, {"tick": torch.tensor(int(self.env.tick[world]))})
-        looking = [world for world in asking if not self.memory.waits(world)]
-        if looking:
-            self.memory.answer(looking, whole.actions[looking])
-            if 0 in looking:
-                self.seen.append(tuple(int(one["tick"]) for one in self.memory.looked_at(0)))
+        querying = [world for world in asking if not self.memory.waits(world)]
+        if querying:
+            self.memory.answer(querying, whole.actions[querying])
+            if 0 in querying:
+                self.seen.append(tuple(int(one["tick"]) for one in self.memory.queried(0)))
         given = self.memory.give(asking)
         actions = torch.zeros(len(observation.state), given.shape[1], 40, dtype=given.dtype)
         actions[asking] = given
@@ -488,11 +488,11 @@ class Pieces(Dated):
 
 
 @pytest.mark.parametrize("latency", [0, 1, 4, 5])
-def test_a_late_policy_of_two_ticks_sees_the_tick_before_its_look(env, latency):
+def test_a_late_policy_of_two_ticks_sees_the_tick_before_its_query(env, latency):
     """Its chunks begin `latency` ticks after a look at that tick and the one before, as a policy's of one tick do."""
     policy, executed = Pieces(), Executed()
     Rollout(env, policy, _episodes(2), recorder=executed, max_steps=20, latency=latency).run()
-    chunks = [100 * look + action for look in (0, 6, 12, 18) for action in range(6)]
+    chunks = [100 * query + action for query in (0, 6, 12, 18) for action in range(6)]
     assert executed.steps[0] == executed.steps[1] == ([0] * latency + chunks)[:20]
     assert policy.seen == [(0, 0), (5, 6), (11, 12), (17, 18)]
 

@@ -31,7 +31,7 @@ WELL = {
 }
 """An episode whose hand came to its target."""
 UNTOUCHED = {"touches": 0, "first_touch": None, "touch_distance": None, "touch_bearing": None, "reach_distance": 0.5}
-"""What differs where nothing was touched."""
+"""Signals that differ when nothing was touched."""
 
 
 def signals(**changes):

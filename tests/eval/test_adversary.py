@@ -17,7 +17,7 @@ from arena_newton.kernels import tick as codes
 
 AXES = (Axis("football", "x", -1.2, 1.2), Axis("football", "y", -1.2, 1.2), Axis("target", "bag", 1.0, 3.0))
 HOLE = (0.9, -0.7)
-"""Where the stand-in's robot fails."""
+"""Placements at which the stand-in's robot fails."""
 
 
 def result(outcome, steps=10, margin=0.0):
@@ -48,7 +48,7 @@ class HoleEnv(FakeEnv):
         return np.where(self.active & (self.tick > 1) & far, codes.SUCCESS, codes.RUNNING).astype(np.int32)
 
     def verdict(self, world):
-        """How far from the hole's rim."""
+        """Distance from the hole's rim."""
         return Verdict(margin=float(np.linalg.norm(np.array(self.samples[world]) - HOLE)) - 0.3)
 
 
@@ -176,7 +176,7 @@ def test_the_search_does_not_depend_on_the_number_of_worlds(tmp_path):
     ],
 )
 def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
-    """What does not fit is named before anything is played or written."""
+    """Unfit flags are named before anything is played or written."""
     assert call(tmp_path / "out", *flags) == 2
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1

@@ -248,7 +248,7 @@ def test_a_line_that_contradicts_itself_fails_by_name(tmp_path, capsys):
 
 
 def test_a_certification_of_nothing_is_no_success(tmp_path, capsys):
-    """Where every check that was asked for is skipped, the command does not end well."""
+    """A certification whose checks are all skipped does not end well."""
     assert main(["certify", "--checks", "official", "--task", "boxing", "--out", str(tmp_path / "c")]) == 1
     said = capsys.readouterr().out
     assert "nothing was measured; this took" in said and "no check failed" not in said
@@ -256,7 +256,7 @@ def test_a_certification_of_nothing_is_no_success(tmp_path, capsys):
 
 @pytest.mark.parametrize("text", ["[]", "null", '{"known_by": "KNOWN", "value": {}}', '{"known_by": "KNOWN", "di', ""])
 def test_a_damaged_measurement_is_measured_again(tmp_path, text):
-    """What is kept counts only as it was written."""
+    """A kept measurement counts only as it was written."""
     context = Context(options(tmp_path), tmp_path, ("boxing",), lambda _: None)
     measured, counts = [{"ticks": 3}, {"ticks": 4}], iter(range(2))
 

@@ -1,4 +1,4 @@
-"""What the checks of a certification measure: on real worlds where it is about bodies, bits and pictures."""
+"""Measurements of the checks of a certification, of bodies, bits and pictures on real worlds."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -250,7 +250,7 @@ def test_engines_and_weights_are_compared_episode_by_episode(monkeypatch):
 
 
 def test_a_rate_at_the_ceiling_is_a_bound():
-    """Where no pair ends otherwise the bound is the exact one of none in n; where all do nothing is bounded."""
+    """If no pair ends otherwise the bound is the exact one of none in n; if all do, nothing is bounded."""
     low, high = agreement.bound_of_difference(0, 0, 280)
     assert high == pytest.approx(1.0 - 0.025 ** (1 / 280)) and low == -high and high < 0.0132
     assert agreement.bound_of_difference(5, 0, 5)[1] == 1.0

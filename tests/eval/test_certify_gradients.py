@@ -39,7 +39,7 @@ def test_a_small_slope_is_measured_by_the_others():
 
 
 def test_kinks_are_left_out_but_not_all():
-    """Where slopes within the step differ nothing is compared; too many such points, or no slope at all, fail."""
+    """Points at which slopes within the step differ are not compared; too many of them, or no slope at all, fail."""
     wrong = ESTIMATES * torch.tensor([1.0, 1.5, 1.0, 1.0, 1.0])
     assert agreement_of(slopes(wrong, torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0]))) == (4, 5, 0.0)
     assert not agreement_of(slopes(ESTIMATES, 0.5)).holds and agreement_of(slopes(ESTIMATES, 0.5)).compared == 0

@@ -94,7 +94,7 @@ def test_a_merge_that_loses_a_line_fails(tmp_path, monkeypatch, name):
 
 
 def test_shards_that_are_not_merged_fail(tmp_path, monkeypatch):
-    """What a merge refuses is the finding, not a complaint about flags."""
+    """A merge that is refused is the finding, not a complaint about flags."""
 
     def refuse(*_, **__):
         raise InputError("episode 3 differs")
@@ -104,7 +104,7 @@ def test_shards_that_are_not_merged_fail(tmp_path, monkeypatch):
 
 
 def certified_refusal():
-    """What is written of it."""
+    """Text that is written of it."""
     said = "shards are not merged: episode 3 differs"
     return {"verdict": "fail", "summary": said, "tables": [], "notes": [], "pictures": []}
 

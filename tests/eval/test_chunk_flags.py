@@ -1,4 +1,4 @@
-"""How chunks are executed: --latency-ticks, --replan, --ensemble, and the protocol that a policy says of itself."""
+"""Execution of chunks: --latency-ticks, --replan, --ensemble, and the protocol that a policy says of itself."""
 
 import dataclasses
 import json
@@ -37,7 +37,7 @@ def run(out, *flags, **parts):
         (["--replan", "5"], "--replan: belongs to --policy lerobot:<checkpoint>, not expert"),
         (["--ensemble"], "--ensemble: belongs to --policy lerobot:<checkpoint>, not expert"),
         (["--replan", "5", "--latency-ticks", "5"], "--latency-ticks 5: expected fewer ticks than --replan 5"),
-        (["--ensemble", "--latency-ticks", "2"], "--latency-ticks 2: --ensemble looks every tick"),
+        (["--ensemble", "--latency-ticks", "2"], "--latency-ticks 2: --ensemble queries every tick"),
         (["--replan", "5", "--policy", "remote:http://h:1"], "--replan: belongs to --policy lerobot:"),
     ],
 )
@@ -48,7 +48,7 @@ def test_flags_that_contradict_are_refused(tmp_path, capsys, flags, says):
 
 
 def test_a_chunk_that_shows_to_be_too_short_stops_the_run(tmp_path, capsys):
-    """A policy that does not say its chunk's length is refused at its first look; nothing is journalled."""
+    """A policy that does not say its chunk's length is refused at its first query; nothing is journalled."""
 
     class Short(FakePolicy):
         chunk_size = 1
@@ -66,7 +66,7 @@ def test_latency_belongs_to_a_run(tmp_path, capsys):
     out = tmp_path / "late"
     assert run(out, "--latency-ticks", "4") == 0
     assert load_run(out).config["latency_ticks"] == 4
-    assert "Each chunk starts 4 ticks (80 ms) after the policy's look." in (out / "report.md").read_text()
+    assert "Each chunk starts 4 ticks (80 ms) after the policy's query." in (out / "report.md").read_text()
     assert main(["resume", str(out)], factories()) == 0
     capsys.readouterr()
     assert run(out) == 2
@@ -115,7 +115,7 @@ def test_latencies_are_rows_of_one_table(tmp_path):
         for n, config in enumerate(changes)
     ]
     text = joint_table(runs)
-    assert "| p, 5 ticks late " in text and "| p, looks every 10 ticks, 5 ticks late " in text
+    assert "| p, 5 ticks late " in text and "| p, queried every 10 ticks, 5 ticks late " in text
     with pytest.raises(InputError, match="is in .* too"):
         joint_table([runs[1], dataclasses.replace(runs[1], folder=tmp_path / "again")])
 

@@ -76,7 +76,7 @@ def test_configuration_is_two_lines(tmp_path, capsys):
 
 
 def test_a_log_file_gets_lines(tmp_path, monkeypatch, capsys):
-    """Where no terminal is, nothing is drawn over: no carriage return, and few lines."""
+    """Without a terminal nothing is drawn over: no carriage return, and few lines."""
     monkeypatch.setenv("FAKE_TICK_S", "0.002")
     flags = ["--task", "football", "boxing", "--engine", "mujoco", "--out", str(tmp_path / "o")]
     assert main(flags, factories()) == 0

@@ -37,7 +37,7 @@ def run_in(folder, per_seed, *, task="football", tracker="t", policy="p", strips
 
 
 def compared(tmp_path, *arguments):
-    """What the command wrote as JSON; it must have ended well."""
+    """JSON that the command wrote; it must have ended well."""
     assert main(["compare", *map(str, arguments), "--out", str(tmp_path / "out")]) == 0
     return json.loads((tmp_path / "out" / "compare.json").read_text())
 
@@ -248,7 +248,7 @@ def test_what_cannot_be_compared_is_refused(folders, monkeypatch, capsys, argume
 
 
 def test_a_file_that_cannot_be_written_is_named(folders, tmp_path, capsys):
-    """Where a file of the comparison cannot be written its path is said, with exit code 2 and no talk of journals."""
+    """A file of the comparison that cannot be written is named, with exit code 2 and no talk of journals."""
     (tmp_path / "compare.html").mkdir()
     assert main(["compare", str(folders / "a"), str(folders / "b"), "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
@@ -282,7 +282,7 @@ def test_a_plan_says_what_it_can_tell(capsys):
 
 
 def test_the_sentence_has_the_direction_of_the_test():
-    """Where few episodes of one task outweigh the mean, the better one is who won more episodes, and it is said."""
+    """If few episodes of one task outweigh the mean, the better one is who won more episodes, and it is said."""
     outcomes = [
         {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] * 4))}
         for won in (True, False)

@@ -43,7 +43,7 @@ def played(tmp_path_factory):
 
 
 def ends(path):
-    """How each episode of a journal ended, with every number that physics decides."""
+    """Ends of the episodes of a journal, with every number that physics decides."""
     keys = (
         "index",
         "episode_seed",

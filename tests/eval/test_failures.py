@@ -107,7 +107,7 @@ def test_only_failures_with_signals_have_a_stage():
 
 
 def test_a_touch_is_one_that_the_journal_knows():
-    """Where the task has a predicate of the touch, an episode without it has touched nothing; unknown, signals say."""
+    """In a task with a predicate of the touch an episode without it has touched nothing; unknown, signals say."""
     touched = {"task": "pp_box", "aligned_ticks": 300}
     assert stage_of(judged(**touched, predicates={"approach": 40, "contact": 300})) == "contact"
     assert stage_of(judged(**touched, predicates={"approach": 40, "contact": None})) == "posture"
@@ -285,7 +285,7 @@ def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
     answers = "number,reader 1,reader 2\n1,perception,perception\n2,approach,posture\n3,contact,tracker\n"
     (tmp_path / "readers.csv").write_text(answers)
     judged = labelled_failures(tmp_path)
-    assert judged[2].said == ("recovery", "contact", "tracking (legs)")
+    assert judged[2].stages == ("recovery", "contact", "tracking (legs)")
     rates = {(one.judges, one.part): (one.same, one.failures) for one in agreements(judged)}
     assert rates[("rules", "reader 1"), "all"] == (2, 3) and rates[("rules", "reader 1"), "even"] == (1, 1)
     assert rates[("rules", "reader 2"), "odd"] == (1, 2) and rates[("reader 1", "reader 2"), "all"] == (1, 3)
@@ -551,7 +551,7 @@ def test_a_misled_expert_sits_down_nowhere_or_without_weight(sofa):
 
 
 def test_saboteurs_play_more_episodes_than_worlds():
-    """What a saboteur changed in a world's episode is forgotten in its next one."""
+    """Changes of a saboteur in a world's episode are forgotten in its next one."""
     env = ArenaEnv("boxing", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
     planned = [SimpleNamespace(index=n, episode_seed=seed) for n, seed in enumerate(SEEDS)]
     expert = SABOTAGES["misaimed"].body.equip(Factories()).policy("expert")

@@ -94,7 +94,7 @@ def test_findings_follow_the_data(cells):
 
 
 def test_a_claim_that_fails_does_not_reproduce():
-    """Where in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
+    """If in three trainings a cell neither visual perturbations nor swaps cost anything, the verdict says so."""
     said = verdicts(findings_of(played_by(3)).values())
     assert said["perturbation: visual drop"] == said["cross-GMT: sonic → twist2"] == "does not"
     assert said["cross-GMT: asymmetric drop"] == said["cross-GMT: asymmetric falls"] == "does not"

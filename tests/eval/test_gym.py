@@ -93,14 +93,14 @@ def test_what_it_returns_is_in_its_spaces(make):
     assert not np.array_equal(seen[1], 0) and seen.std() > 0
     final = info["final_info"]
     assert (final["outcome"][0], final["reason"][0], final["seed"][0]) == ("fall", "fall", 3)
-    assert info["seed"].tolist() == [5, 4] and info["settling"].tolist() == [True, False]
+    assert info["seed"].tolist() == [5, 4] and info["startup"].tolist() == [True, False]
     picture = env.render()
     assert np.array_equal(picture[1], observation["pixels"]["front"][1])
 
 
 def test_an_observation_is_the_callers(make):
-    """What was returned does not change with later steps."""
-    env = make(image_size=(40, 32), settle="reset")
+    """A returned observation does not change with later steps."""
+    env = make(image_size=(40, 32), startup="reset")
     first, _ = env.reset(seed=0)
     kept = {name: first[name].copy() for name in ("agent_pos", "pixels")}
     for tick in range(10):
@@ -124,27 +124,27 @@ def test_one_world_passes_gymnasiums_checker():
     env = gymnasium.make("arena_newton/Football-v0", engine="mujoco", device="cpu", image_size=(40, 32))
     check_env(env.unwrapped, skip_render_check=True)
     observation, info = env.reset(seed=21)
-    assert (info["seed"], info["settling"]) == (21, True)
+    assert (info["seed"], info["startup"]) == (21, True)
     assert info["episode_seed"] == seeding.episode_seed(tasks.get("football").gym_id, 1, 1)
     env.close()
     with pytest.raises(InputError, match="num_envs"):
         gym.ArenaGymEnv("football", num_envs=2)
 
 
-@pytest.mark.parametrize("settle", gym.SETTLE)
-def test_a_seed_is_an_episode_of_the_plan(make, boxed, settle):
+@pytest.mark.parametrize("startup", gym.STARTUP)
+def test_a_seed_is_an_episode_of_the_plan(make, boxed, startup):
     """An expert's actions give the states of a rollout at every tick, start-up included, and its results."""
     table, hashes, played = boxed
     results = {result.episode.episode_seed: result for result in played}
-    env = make(settle=settle, autoreset_mode="disabled")
+    env = make(startup=startup, autoreset_mode="disabled")
     _, info = env.reset(seed=0)
     seeds = info["episode_seed"].tolist()
     assert seeds == [episode.episode_seed for episode in planned("boxing", 2)]
-    assert info["settling"].all() == (settle == "steps")
+    assert info["startup"].all() == (startup == "steps")
     total, over = np.zeros(2), np.zeros(2, bool)
     while not over.all():
         action = np.stack([table.at(seed, tick) for seed, tick in zip(seeds, info["steps"], strict=True)])
-        if info["settling"].any():
+        if info["startup"].any():
             action[:] = 7.0  # ignored
         _, reward, terminated, truncated, info = env.step(action)
         total += reward
@@ -174,7 +174,7 @@ def test_autoreset_plays_the_plan_as_a_rollout_does(make, watched_worlds):
 
 def test_next_step_resets_in_the_step_after_the_end(make):
     """NEXT_STEP: the end is returned with its own observation; the next step ignores the action and begins."""
-    env = make("football", autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=2, settle="reset")
+    env = make("football", autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=2, startup="reset")
     env.reset(seed=[4, 8])
     env.step(stand(env))
     last, _, _, truncated, info = env.step(stand(env))
@@ -186,7 +186,7 @@ def test_next_step_resets_in_the_step_after_the_end(make):
 
 def test_an_ended_world_is_frozen(make):
     """DISABLED: after its end a world keeps state, picture, flags and info, with reward 0, until its reset."""
-    env = make(image_size=(40, 32), autoreset_mode="disabled", settle="reset", reward="margin")
+    env = make(image_size=(40, 32), autoreset_mode="disabled", startup="reset", reward="margin")
     env.reset(seed=0)
     ended = None
     for tick in range(150):
@@ -212,20 +212,20 @@ def test_an_ended_world_is_frozen(make):
     assert not terminated.any() and info["steps"].tolist() == [1, tick + 2]
 
 
-@pytest.mark.parametrize("settle", gym.SETTLE)
+@pytest.mark.parametrize("startup", gym.STARTUP)
 @pytest.mark.parametrize(
     ("engine", "tracker", "ticks"), [("mujoco", "twist2", 10), ("mujoco", "sonic", 10), ("warp", "twist2", 2)]
 )
-def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine, tracker, ticks, settle):
+def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine, tracker, ticks, startup):
     """World 1 goes through the same states whether world 0 is reset (start-up included) or not."""
-    env = make("football", engine=engine, tracker=tracker, settle=settle)
+    env = make("football", engine=engine, tracker=tracker, startup=startup)
     monkeypatch.setattr(env.env, "startup_ticks", ticks)
     runs = []
     for disturbed in (False, True):
         WatchedEnv.history.clear()
         _, info = env.reset(seed=0)
         seed = info["episode_seed"][1]
-        if settle == "steps":
+        if startup == "steps":
             for _ in range(ticks):
                 env.step(stand(env))
         for tick in range(ticks):
@@ -233,7 +233,7 @@ def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine
         if disturbed:
             mask = np.array([True, False])
             _, info = env.reset(seed=[77, None], options={"reset_mask": mask})
-            assert info["_settling"].tolist() == mask.tolist() and info["seed"].tolist() == [77, 1]
+            assert info["_startup"].tolist() == mask.tolist() and info["seed"].tolist() == [77, 1]
         for _ in range(ticks):
             observation, *_ = env.step(stand(env))
         runs.append((list(WatchedEnv.history[seed]), observation["agent_pos"][1].tobytes()))
@@ -242,8 +242,8 @@ def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine
 
 def test_a_fall_in_the_start_up(make, monkeypatch):
     """Led through by the reset, it is terminated by the first step; in steps, by the step in which it falls."""
-    for settle in gym.SETTLE:
-        env = make("football", settle=settle, autoreset_mode="disabled")
+    for startup in gym.STARTUP:
+        env = make("football", startup=startup, autoreset_mode="disabled")
         env.reset(seed=0)
         upside = env.env.spec.spawn_position, (0.0, 1.0, 0.0, 0.0)
         original = type(env.env).reset
@@ -254,10 +254,10 @@ def test_a_fall_in_the_start_up(make, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(type(env.env), "reset", spawn)
             _, info = env.reset(seed=0)
-        assert not info["settling"].any() if settle == "reset" else info["settling"].all()
+        assert not info["startup"].any() if startup == "reset" else info["startup"].all()
         for _ in range(51):
             _, reward, terminated, truncated, info = env.step(stand(env))
-            if terminated.any() or settle == "reset":
+            if terminated.any() or startup == "reset":
                 break
         assert terminated.all() and not truncated.any() and not reward.any()
         assert info["reason"].tolist() == ["startup_fall"] * 2 and info["steps"].tolist() == [0, 0]
@@ -265,7 +265,7 @@ def test_a_fall_in_the_start_up(make, monkeypatch):
 
 def test_an_action_that_is_not_finite_ends_one_episode(make):
     """It is an error, told as truncated; the other world goes on."""
-    env = make("football", settle="reset")
+    env = make("football", startup="reset")
     env.reset(seed=0)
     action = stand(env)
     action[0, 5] = np.nan
@@ -276,7 +276,7 @@ def test_an_action_that_is_not_finite_ends_one_episode(make):
 
 def test_the_margin_as_reward(make):
     """Its rewards add up to the change of the task's margin since the first tick."""
-    env = make(reward="margin", settle="reset", autoreset_mode="disabled")
+    env = make(reward="margin", startup="reset", autoreset_mode="disabled")
     env.reset(seed=0)
     total = np.zeros(2)
     for tick in range(30):
@@ -359,7 +359,7 @@ def shared_env():
     [
         ({"num_envs": 0}, "num_envs 0"),
         ({"task": "golf"}, "golf"),
-        ({"settle": "never"}, "settle never: unknown, choose from steps, reset"),
+        ({"startup": "never"}, "startup never: unknown, choose from steps, reset"),
         ({"reward": "fame"}, "reward fame"),
         ({"autoreset_mode": "sometimes"}, "autoreset_mode sometimes"),
         ({"render_mode": "human"}, "render_mode human"),
@@ -382,5 +382,5 @@ def test_the_page_about_gymnasium():
     world = {"__name__": "docs_gym"}
     for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
         exec(compile(block, "docs/gym.md", "exec"), world)
-    assert world["action"].shape == (2, 40) and not world["info"]["settling"]
+    assert world["action"].shape == (2, 40) and not world["info"]["startup"]
     assert (world["info"]["seed"], world["info"]["steps"]) == (21, 1)

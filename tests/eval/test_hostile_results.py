@@ -288,7 +288,7 @@ def test_integers_that_no_float_holds_are_refused(base, capsys, place, raw):
     ],
 )
 def test_a_configuration_of_other_types_is_refused(base, capsys, place, raw):
-    """What a configuration holds has the types that a run writes."""
+    """Values of a configuration have the types that a run writes."""
     path = base / "config.json"
     path.write_text(with_raw(json.loads(path.read_text()), place, raw))
     refused(base, capsys, place[-1])

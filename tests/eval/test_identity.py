@@ -1,4 +1,4 @@
-"""What a run is known by covers all code, scenes and rules that its episodes depend on, and nothing else."""
+"""Identity of a run: all code, scenes and rules that its episodes depend on, and nothing else."""
 
 import dataclasses
 import functools
@@ -98,7 +98,7 @@ def test_held_out_looks_count_where_they_are_played():
 
 
 def test_a_new_folder_of_scenes_counts(tmp_path):
-    """What lies beside the scenes, such as materials in a folder of their own, counts without being named."""
+    """Files next to the scenes, such as materials in a folder of their own, count without being named."""
     (tmp_path / "usd_scenes" / "materials").mkdir(parents=True)
     (tmp_path / "usd_scenes" / "materials" / "oak.usda").write_text("")
     (tmp_path / "usd_scenes" / "football").mkdir()

@@ -76,7 +76,7 @@ def test_second_writer_is_refused(tmp_path):
 
 
 def test_full_disk_keeps_the_lines_before(tmp_path, monkeypatch):
-    """When the disk fills in the middle of a line, that line is taken back and the error says what is kept."""
+    """A disk that fills in the middle of a line: the line is taken back and the error says what is kept."""
     path = tmp_path / "episodes.jsonl"
     write = os.pwrite
 
@@ -114,7 +114,7 @@ def test_atomic_write_onto_a_full_disk(tmp_path, monkeypatch):
 
 
 def test_atomic_write_where_nothing_can_be_written(tmp_path):
-    """Where even the partial file cannot be removed, the first cause is told."""
+    """If even the partial file cannot be removed, the first cause is told."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         write_atomic(tmp_path / "file" / "report.md", "new")
@@ -139,7 +139,7 @@ def test_writing_follows_no_link(tmp_path):
 
 
 def test_a_pipe_is_no_journal(tmp_path):
-    """What is no regular file is refused at once instead of waiting for a writer."""
+    """A path that is not a regular file is refused at once instead of waiting for a writer."""
     os.mkfifo(tmp_path / "episodes.jsonl")
     for read in (Journal, read_journal):
         with pytest.raises(InputError, match="not a regular file"):

@@ -95,7 +95,7 @@ def as_it_is(batch):
 
 
 def evaluate(monkeypatch, checkpoint, out, task, *flags, episodes=2):
-    """What LeRobot's command line wrote of the first episodes."""
+    """Results that LeRobot's command line wrote of the first episodes."""
     arguments = [PLUGIN, "--env.type=arena_newton", f"--env.task={task}", "--env.engine=mujoco", "--env.device=cpu"]
     arguments += [f"--env.image_width={SIDE}", f"--env.image_height={SIDE}", f"--policy.path={checkpoint}"]
     arguments += ["--policy.device=cpu", f"--eval.n_episodes={episodes}", f"--eval.batch_size={episodes}", "--seed=0"]

@@ -43,7 +43,7 @@ def nodes(tmp_path_factory, poison):
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """What one process writes without Ray."""
+    """Files of one process without Ray."""
     folder = tmp_path_factory.mktemp("alone")
     assert main(["run", *PLAN, "--out", str(folder / "run")], factories()) == 0
     merge([folder / "run"], folder / "merged")

@@ -1,4 +1,4 @@
-"""What the driver of `run --ray` does with what processes tell: nothing is lost, nothing counts twice."""
+"""The driver of `run --ray` and the messages of processes: nothing is lost, nothing counts twice."""
 
 from types import SimpleNamespace
 
@@ -15,8 +15,8 @@ from arena_newton.eval.play.run import RunStopped, check_parts
 from arena_newton.eval.play.run_flow import begun, progress_of
 from arena_newton.eval.records.journal import Journal, read_journal
 from arena_newton.eval.workers import dealing
-from arena_newton.eval.workers.slice_events import Done, Ended, Slice
-from arena_newton.eval.workers.slice_player import play
+from arena_newton.eval.workers.batch_player import play
+from arena_newton.eval.workers.messages import Done, Ended, EpisodeBatch
 from arena_newton.eval.workers.worker_pool import Job, Lost, Worker
 from arena_newton.physics import devices
 
@@ -47,7 +47,7 @@ class StubPool:
             if assignment is None:
                 continue
             told = []
-            part = Slice(
+            part = EpisodeBatch(
                 " ".join(assignment.group),
                 tuple(assignment.left),
                 assignment.worlds,
@@ -74,7 +74,7 @@ def driven(tmp_path):
         job = Job(folder)
         pool = StubPool(job, size, lost, made_of)
         with Journal(folder.journal) as journal:
-            folder.settle(config, journal.records)
+            folder.prepare(config, journal.records)
             done, waiting = begun(config, folder, journal)
             dealing._play(dealing.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         return read_journal(folder.journal)[0], pool, folder
@@ -83,13 +83,13 @@ def driven(tmp_path):
 
 
 def outcomes(records):
-    """What came of each episode, by number; each is there once."""
+    """Ends of the episodes, by number; each is there once."""
     assert len({record.index for record in records}) == len(records)
     return {record.index: (record.outcome, record.steps, record.margin) for record in records}
 
 
-def test_slices_cover_the_plan_once(driven, tmp_path):
-    """All episodes are played once in slices of at most two batches, with a run's outcomes."""
+def test_batches_cover_the_plan_once(driven, tmp_path):
+    """All episodes are played once in batches of at most twice the worlds, with a run's outcomes."""
     records, pool, _ = driven()
     assert main(["run", "--task", "football", "boxing", "--seeds", "0", "1", "--repeats", "4", "--engine", "mujoco",
                  "--out", str(tmp_path / "one")], factories()) == 0  # fmt: skip
@@ -113,7 +113,7 @@ def test_losses_lose_nothing(driven):
 
 
 def test_what_ended_before_a_loss_is_not_played_again(driven):
-    """An episode that was told of is in the journal, and in no later slice."""
+    """An episode that was told of is in the journal, and in no later batch."""
     known = set()
 
     def lost(assignment, told):
@@ -127,7 +127,7 @@ def test_what_ended_before_a_loss_is_not_played_again(driven):
 
 
 def test_a_poison_episode_ends_as_an_error_and_the_rest_goes_on(driven):
-    """Who is running at a loss comes into a smaller slice, then alone; after the attempts alone it is an error."""
+    """Episodes that run at a loss come into a smaller batch, then alone; after the attempts alone one is an error."""
     undisturbed, _, _ = driven(out="u")
 
     def lost(assignment, told):
@@ -151,7 +151,7 @@ def test_where_every_episode_breaks_the_run_stops(driven):
 
 
 def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):
-    """A process that dies while it builds costs no episode an attempt, and slices stay as large."""
+    """A process that dies while it builds costs no episode an attempt, and batches stay as large."""
     count = iter(range(100))
     records, pool, _ = driven(
         lambda assignment, told: (0, Lost("it died")) if next(count) < 6 else None, ray_attempts=1
@@ -161,7 +161,7 @@ def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):
 
 
 def test_a_lost_machine_blames_no_episode(driven):
-    """When a machine leaves the cluster, what ran there is not suspected."""
+    """Episodes of a machine that left the cluster are not suspected."""
     count = iter(range(100))
     records, pool, _ = driven(
         lambda assignment, told: (1, Lost("gone", with_node=True)) if next(count) < 12 else None,

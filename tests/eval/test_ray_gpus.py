@@ -31,7 +31,7 @@ def cluster(tmp_path_factory):
 
 
 def play(cluster, out, *flags):
-    """How many processes see which GPUs, and the episodes of a suite on engine warp."""
+    """Number of processes per GPU that they see, and the episodes of a suite on engine warp."""
     nodes, folder = cluster
     (folder / "suite.toml").write_text(SUITE.replace('"mujoco"', '"warp"'))
     (folder / "gpus.txt").unlink(missing_ok=True)

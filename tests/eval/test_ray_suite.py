@@ -26,7 +26,7 @@ from ray.exceptions import ActorDiedError  # noqa: E402
 from arena_newton.eval.workers import local_backend, ray_backend, worker_pool  # noqa: E402
 from arena_newton.eval.workers.actor import EpisodeActor  # noqa: E402
 from arena_newton.eval.workers.backend import WorkerLost  # noqa: E402
-from arena_newton.eval.workers.slice_events import Done, Node  # noqa: E402
+from arena_newton.eval.workers.messages import Done, Node  # noqa: E402
 
 
 class Answer:
@@ -37,7 +37,7 @@ class Answer:
 
 
 class InlineRay:
-    """What the pool uses of Ray; `dies` is asked before each answer."""
+    """The part of Ray that the pool uses; `dies` is asked before each answer."""
 
     def __init__(self, dies=lambda: False, cores=2.0):
         self.dies, self.opened, self.actors, self.killed = dies, [], 0, 0

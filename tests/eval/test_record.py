@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from arena_newton import policies
-from arena_newton.data.recording import demonstration, film_pool
+from arena_newton.data.recording import demonstration, encoder_pool
 from arena_newton.data.recording.episode import EpisodeFile, episode_files
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
@@ -67,7 +67,7 @@ def contents(folder):
 
 
 def same(folder, other):
-    """Whether two folders hold the same episodes, byte for byte; the names that differ are shown."""
+    """Asserts that two folders hold the same episodes, byte for byte; the names that differ are shown."""
     mine, others = contents(folder), contents(other)
     assert sorted(mine) == sorted(others)
     assert [name for name in mine if mine[name] != others[name]] == []
@@ -125,7 +125,7 @@ def test_bytes_do_not_depend_on_who_encodes(brief, tmp_path, parts, monkeypatch)
 def test_a_killed_encoder_stops_the_run(brief, tmp_path, parts, monkeypatch, capsys):
     """Kill -9 of a process that encodes is one error, exit code not 0, without partial files; resumed, all is there."""
     folder, started, frames = tmp_path / "killed", [], []
-    popen, add = subprocess.Popen, film_pool.FilmPool.add
+    popen, add = subprocess.Popen, encoder_pool.EncoderPool.add
 
     def start(*command, **options):
         started.append(popen(*command, **options))
@@ -138,8 +138,8 @@ def test_a_killed_encoder_stops_the_run(brief, tmp_path, parts, monkeypatch, cap
             started[0].kill()
 
     monkeypatch.setattr(recording, "encoding_processes", lambda: 2)
-    monkeypatch.setattr(film_pool.subprocess, "Popen", start)
-    monkeypatch.setattr(film_pool.FilmPool, "add", kill)
+    monkeypatch.setattr(encoder_pool.subprocess, "Popen", start)
+    monkeypatch.setattr(encoder_pool.EncoderPool, "add", kill)
     assert main(["record", *BRIEF, "--worlds", "3", "--out", str(folder)], parts) != 0
     said = capsys.readouterr().err
     assert "a process that encodes pictures ended (SIGKILL; out of memory?)" in said and "Traceback" not in said
@@ -188,7 +188,7 @@ def test_ctrl_c_leaves_nothing_behind(brief, tmp_path, parts, monkeypatch, capsy
         return render(self, *pictures)
 
     monkeypatch.setattr(recording, "encoding_processes", lambda: processes)
-    monkeypatch.setattr(film_pool.subprocess, "Popen", start)
+    monkeypatch.setattr(encoder_pool.subprocess, "Popen", start)
     monkeypatch.setattr(Camera, "render", interrupt)
     assert main(["record", *BRIEF, "--worlds", "2", "--out", str(folder)], parts) == 130
     said = capsys.readouterr()
@@ -260,7 +260,7 @@ def test_only_successes_are_kept_in_rounds(brief, tmp_path, parts, capsys):
 
 
 def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, parts, monkeypatch):
-    """Where the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
+    """If the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
     renders = []
     render = Camera.render
     monkeypatch.setattr(Camera, "render", lambda self, *a: renders.append(1) or render(self, *a))

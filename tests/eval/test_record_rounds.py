@@ -1,4 +1,4 @@
-"""Which attempts are due when successes are wanted."""
+"""Attempts that are due when successes are wanted."""
 
 import random
 
@@ -107,13 +107,13 @@ def test_pictures_of_the_sensors_shape_have_no_bars():
     ],
 )
 def test_unfit_flags_are_named(changes, says):
-    """What cannot be recorded is one error that names the flag."""
+    """A recording that cannot be made is one error that names the flag."""
     with pytest.raises(InputError, match=says):
         resolve(recording_run(RecordOptions(engine="mujoco", device="cpu", **changes)))
 
 
 def test_nothing_kept_is_nothing_to_build(tmp_path):
-    """Where no episode was kept, no dataset is advised."""
+    """If no episode was kept, no dataset is advised."""
     config = resolve(recording_run(RecordOptions(task=("boxing",), only_success=True, engine="mujoco", device="cpu")))
     lines = outcome_lines(config, tmp_path, [])
     assert lines[0].startswith("recorded: 0 episodes") and not [line for line in lines if "dataset:" in line]

@@ -98,7 +98,7 @@ def test_another_motion_is_an_error_that_names_the_tick(bare, tmp_path, capsys, 
 
 @pytest.mark.parametrize("key", ["code", "checkpoint", "rules_hash", "scenes"])
 def test_other_code_weights_rules_or_scene_are_refused(bare, tmp_path, capsys, key):
-    """What was recorded with something else is not played under a wrong name."""
+    """A recording that was made with something else is not played under a wrong name."""
     facts = EpisodeFile(episode_files([bare])[0]).json("arena_configuration") | {key: "0123456789ab"}
     folder = changed(bare, tmp_path / "other", arena_configuration=np.array(json.dumps(facts)))
     assert main(["record", "--from", str(folder), "--size", "64x48", "--out", str(tmp_path / "out")]) == 2

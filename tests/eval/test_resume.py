@@ -84,7 +84,7 @@ def test_environments_are_stored_in_the_plans_order(tmp_path):
     options = RunOptions(task=("football", "boxing"), mode=("base", "visual"), seeds=(0,), repeats=1, engine="mujoco")
     folder = ResultsFolder(tmp_path, resolve(options), doctor.versions())
     folder.make()
-    folder.settle(folder.config, ())
+    folder.prepare(folder.config, ())
     names = [f"{task} twist2 {mode}" for task in ("football", "boxing") for mode in ("base", "visual")]
     for name in (names[2], names[3], names[0], names[2], names[1]):
         assert folder.register(name, {"engine": name}) == {"engine": name}
@@ -189,7 +189,7 @@ class BreaksOnce(FakeEnv):
     ],
 )
 def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrupted, capsys, error, says):
-    """What breaks as a whole is no episode's error: one line, code 2, nothing lost; resume ends in the same bytes."""
+    """A break of the whole run is no episode's error: one line, code 2, nothing lost; resume ends in the same bytes."""
     folder = tmp_path / "d"
     breaks = type("Breaks", (BreaksOnce,), {"error": error})
     assert main(["run", *FLAGS, "--worlds", "3", "--out", str(folder)], factories(env=breaks)) == 2
@@ -271,7 +271,7 @@ def test_errors_are_told_with_reasons(tmp_path, capsys):
 
 
 def test_partial_recordings_are_swept_away(tmp_path):
-    """What an interrupted recording left is gone when a run ends, however it ends."""
+    """Partial files of an interrupted recording are gone when a run ends, however it ends."""
     folder = tmp_path / "s"
 
     class Leaves(FakeEnv):
@@ -286,7 +286,7 @@ def test_partial_recordings_are_swept_away(tmp_path):
 
 
 def test_environments_stand_in_configuration_and_journal(uninterrupted):
-    """What each task and mode was built with stands once in config.json; every journal line carries its hash."""
+    """Facts of each task's and mode's environment are once in config.json; every journal line carries their hash."""
     document = json.loads((uninterrupted / "config.json").read_text())
     assert list(document["environments"]) == [
         f"{t} twist2 {m}" for t in ("football", "boxing") for m in ("base", "execution")
@@ -373,7 +373,7 @@ def test_a_killed_beginning_can_be_begun_again(tmp_path):
 
 
 def status(folder):
-    """Where config.json says that the run stands."""
+    """Status of the run in config.json."""
     return json.loads((folder / "config.json").read_text())["status"]
 
 

@@ -17,7 +17,7 @@ from arena_newton.eval.plan.episode_plan import expand
 from arena_newton.eval.play.run import _record
 from arena_newton.eval.records import journal
 from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, read_journal
-from arena_newton.eval.records.schema import Fit
+from arena_newton.files.stored_json import Fit
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 JOURNALS = Path(__file__).parent / "journals"
@@ -55,7 +55,7 @@ def test_journals_of_every_schema_are_reported(tmp_path, capsys, schema):
 
 @pytest.mark.parametrize("schema", range(1, SCHEMA + 1))
 def test_old_keys_keep_name_order_and_format(schema):
-    """What a line of an older schema holds is a part of the same line today, in the same order and bytes."""
+    """A line of an older schema is a part of the same line today, in the same order and bytes."""
     lines = [json.loads(line) for line in (JOURNALS / f"schema_{schema}.jsonl").read_text().splitlines()]
     for line, found in zip(lines, read_journal(JOURNALS / f"schema_{schema}.jsonl")[0], strict=True):
         written = found.to_json()

@@ -60,7 +60,7 @@ def rows(path):
 @pytest.mark.parametrize("task", tasks.names())
 @pytest.mark.parametrize("mode", ["base", "execution"])
 def test_every_task_has_axes_and_its_draws_lie_on_them(task, mode):
-    """What the seeds draw is within the axes' ranges, and everything that differs between seeds is an axis."""
+    """Draws of the seeds are within the axes' ranges, and everything that differs between seeds is an axis."""
     spec, rules = tasks.get(task), PAPER.task(task)
     axes = axes_of(rules, mode)
     drawn = [spec.sample(seed, mode, rules) for seed in range(20)]
@@ -157,7 +157,7 @@ def test_one_axis_is_a_map_of_one_row(tmp_path):
     ],
 )
 def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
-    """What does not fit is named before anything is played or written."""
+    """Unfit flags are named before anything is played or written."""
     assert call(tmp_path / "out", *flags) == 2
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1

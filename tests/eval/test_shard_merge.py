@@ -34,7 +34,7 @@ def contents(folder):
 
 
 def configuration(folder):
-    """What of a config.json says what was played."""
+    """The part of a config.json that says what was played."""
     document = json.loads((folder / "config.json").read_text())
     return {key: value for key, value in document.items() if key not in ("status", "options")}
 
@@ -172,7 +172,7 @@ def test_overlaps_of_other_times_join(copied):
 
 
 def test_an_error_gives_way(copied, played):
-    """Where an episode ended as an error in one folder, the other folder's counts, as after --retry-errors."""
+    """Of an episode that ended as an error in one folder the other folder's counts, as after --retry-errors."""
     shutil.copytree(copied / "s1", copied / "again")
     broken = {"outcome": "error", "reason": "environment", "error": "out of memory", "steps": 0}
     edited(copied / "s1", lambda line: line.update(broken))
@@ -364,7 +364,7 @@ def test_linked_recordings_are_refused(copied):
 
 
 def test_a_full_disk_leaves_nothing(copied, monkeypatch, capsys):
-    """When the disk is full while recordings are copied: one line, exit code 2, no half folder."""
+    """A disk that is full while recordings are copied: one line, exit code 2, no half folder."""
 
     def full(source, target, length):
         raise OSError(28, "No space left on device")

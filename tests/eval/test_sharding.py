@@ -43,7 +43,7 @@ def test_shards_are_the_plan(count):
 
 
 def test_the_deal_is_shuffled_and_fixed():
-    """Which episodes a shard has is neither their order nor this machine's chance: it is the same in every version."""
+    """A deal follows neither the order of episodes nor this machine's chance: it is the same in every version."""
     keys = [("boxing", "twist2", "base", seed, repeat) for seed in range(2) for repeat in range(6)]
     assert dealt(keys, Shard(1, 3)) == [0, 5, 8, 11]
     assert dealt([*keys, ("football", "twist2", "base", 0, 0)], Shard(1, 3)) == [0, 5, 8, 11, 12]
@@ -60,7 +60,7 @@ def test_shards_are_no_part_of_the_identity():
 )
 @pytest.mark.parametrize("command", ["run", "list", "record"])
 def test_bad_shards(command, value, capsys, tmp_path, monkeypatch):
-    """What is no shard ends with exit code 2 and one line that names flag and value; nothing is written."""
+    """A value that is not a shard ends with exit code 2 and one line that names flag and value; nothing is written."""
     monkeypatch.chdir(tmp_path)
     assert main([command, "--task", "boxing", f"--shard={value}"], factories()) == 2
     error = capsys.readouterr().err.strip()

@@ -103,7 +103,7 @@ def test_tiles_are_in_rows():
     ],
 )
 def test_bad_input_is_one_line(folder, tmp_path, monkeypatch, capsys, flags, message):
-    """What cannot be written is said in one line with code 2, and leaves no file."""
+    """A film that cannot be written is one line with code 2, and leaves no file."""
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     assert main(["film", str(folder), *flags]) == 2

@@ -98,7 +98,7 @@ def test_what_was_not_trained_is_under_no_tracker_of_its_training(tables):
 
 
 def test_rows_of_others_are_marked(tables):
-    """What others published stands beside the paper's numbers, marked as self-reported in another simulator."""
+    """Numbers that others published are next to the paper's, marked as self-reported in another simulator."""
     (other,) = published()
     assert other.policy == "WB-WAM" and sum(other.rates.values()) / 7 == pytest.approx(0.819, abs=5e-4)
     assert row(tables["in_gmt"], "sonic", "WB-WAM", "self-reported")["DoubleDesk"] == "65.0"
@@ -379,7 +379,7 @@ def test_text_stays_text(text):
 
 
 def balanced(latex):
-    """What a LaTeX text lacks: environments or braces that do not close, columns that a row lacks."""
+    """Faults of a LaTeX text: environments or braces that do not close, columns that a row lacks."""
     found, stack = [], []
     for kind, name in re.findall(r"\\(begin|end)\{(\w+)\}", latex):
         if kind == "begin":

@@ -26,7 +26,7 @@ def cells(table):
 
 
 def said(won, played):
-    """What a cell says."""
+    """Text of a cell."""
     low, high = wilson(won, played)
     return f"{won}/{played} ({100 * low:.0f} to {100 * high:.0f})"
 

@@ -36,7 +36,7 @@ def test_it_ends_where_the_interval_is_narrow():
 
 
 def test_group_seeds_take_turns():
-    """What is played first has as many episodes of each group seed, whenever it ends."""
+    """The first episodes are as many of each group seed, whenever playing ends."""
     rule, group = WidthRule(0.14, 200, 3), list(range(201))
     counts = [sum(index // 67 == seed for index in rule.order(group)[:40]) for seed in range(3)]
     assert counts == [14, 13, 13] and len(rule.order(group)) == 200

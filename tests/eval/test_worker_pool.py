@@ -1,4 +1,4 @@
-"""How processes of a cluster are asked for, held to their deadline and replaced; a stand-in for Ray answers."""
+"""Processes of a cluster are asked for, held to their deadline and replaced; a stand-in for Ray answers."""
 
 import dataclasses
 import os
@@ -15,7 +15,7 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
-from arena_newton.eval.workers.slice_events import Broke, Built, Done, Node, Opened, Ticks
+from arena_newton.eval.workers.messages import Broke, Built, Done, Node, Opened, Ticks
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
@@ -32,7 +32,7 @@ class Ref:
 
 
 class Stream:
-    """The answers of a slice."""
+    """The answers of a batch."""
 
     def __init__(self, values, hangs):
         self.left, self.hangs = [Ref(value) for value in values], hangs
@@ -59,7 +59,7 @@ class Method:
 
 
 class FakeRay:
-    """What the pool uses of Ray; a test says what actors answer."""
+    """The part of Ray that the pool uses; a test says what actors answer."""
 
     def __init__(self, opened, nodes):
         self.node_list, self.opened, self.asked, self.killed = nodes, opened, [], []
@@ -141,7 +141,7 @@ def assignment(pool, config):
 
 
 def messages(pool, rounds=6):
-    """What comes in so many rounds."""
+    """Messages of so many rounds."""
     return [message for _ in range(rounds) for _, _, message in pool.messages()]
 
 
@@ -178,7 +178,7 @@ def test_machines_that_join_are_used(pool_of, monkeypatch):
     assert len(pool.workers) == 4
 
 
-def test_a_slice_is_told_of(pool_of):
+def test_a_batch_is_reported(pool_of):
     """Events come in their order, then the end; then the process waits."""
     pool, fake, config = pool_of(ray_actors=1)
     all_idle(pool)
@@ -187,8 +187,8 @@ def test_a_slice_is_told_of(pool_of):
     assert messages(pool) == [Built({}), Ticks(3), Done()] and pool.idle()
 
 
-def test_a_slice_past_its_deadline_is_stopped(pool_of):
-    """Its process is killed, the slice is told of as lost, and another process is asked for."""
+def test_a_batch_past_its_deadline_is_stopped(pool_of):
+    """Its process is killed, the batch is reported as lost, and another process is asked for."""
     pool, fake, config = pool_of(ray_actors=1, ray_minutes=0.001)
     all_idle(pool)
     fake.hangs = True

@@ -1,4 +1,4 @@
-"""What the kernel tests share: devices, random stages, and rotations and boxes in plain NumPy (matrices, float64)."""
+"""Fixtures of the kernel tests: devices, random stages, and rotations and boxes in plain NumPy (matrices, float64)."""
 
 import itertools
 import sys

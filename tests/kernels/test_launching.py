@@ -78,7 +78,7 @@ def test_arguments_of_every_kind_are_packed_once():
 
 
 def test_another_kind_of_launch_is_left_to_warp():
-    """Where Warp's recorded launch does not look as it is known, Warp launches."""
+    """Warp launches a kernel itself if its recorded launch does not look as it is known."""
     a, out = wp.array([1.0, 2.0], dtype=float, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
     command = launching.record(_launch, a, 2.0, out).commands[0]
     command.block_dim = 2

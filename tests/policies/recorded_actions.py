@@ -1,4 +1,4 @@
-"""What an expert did, kept by episode: for tests that compare two runs bit for bit."""
+"""Actions of an expert by episode, for tests that compare two runs bit for bit."""
 
 from arena_newton.interfaces import Recorder
 

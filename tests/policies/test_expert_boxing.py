@@ -74,7 +74,7 @@ def test_a_silhouette_is_the_near_side_of_a_ball():
 
 
 def test_eyes_agree_with_pictures(env):
-    """What the eyes say of the target is what rendered pictures show, at the 60 starts and at 60 places all around."""
+    """Eyes and rendered pictures agree about the target, at the 60 starts and at 60 places all around."""
     env.reset(protocol(60))
     sight = Sight(env)
     eyes, target = Eyes(sight), sight.frame(BOUNDS)

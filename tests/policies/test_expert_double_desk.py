@@ -133,7 +133,7 @@ def test_a_hammer_on_the_floor_ends_the_attempt(expert):
 
 
 def test_an_episode_begins_as_if_it_were_the_first(expert):
-    """What an episode's hands end with is no part of the next one in its world; other worlds keep theirs."""
+    """Hands at the end of an episode are no part of the next one in its world; other worlds keep theirs."""
     everyone = torch.ones(2, dtype=torch.bool)
     expert.machine.enter("open", everyone)
     for _ in range(5):

@@ -145,7 +145,7 @@ def test_an_episode_does_not_depend_on_its_world(twist2, played):
 
 
 def test_a_missed_seat_is_tried_again():
-    """Where sitting does not count, the robot stands up from the seat, steps back again and sits down a second time."""
+    """A robot whose sitting does not count stands up, steps back again and sits down a second time."""
     env = ArenaEnv("sit_sofa", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
     env.judge.rule = dataclasses.replace(env.judge.rule, min_force=1e9)
     (result,) = Rollout(env, policies.get("expert"), episodes(env, 0), max_steps=1400).run()

@@ -106,7 +106,7 @@ def test_unknown_task_is_named():
 
 
 def play(task, indices, ticks):
-    """Which worlds succeed when robots obey their references exactly, and each one's phases in their order."""
+    """Worlds that succeed when robots obey their references exactly, and each one's phases in their order."""
     env = ArenaEnv(task, tracker=trackers.get("pd"), worlds=len(indices), engine="mujoco", device="cpu", threads=1)
     seeds = [seeding.episode_seed(env.spec.gym_id, i // 20, i % 20) for i in indices]
     env.reset(seeds)

@@ -15,7 +15,7 @@ from arena_newton.robot.rotations import matrix_from_quat, quat_from_euler
 RATE = 0.05
 """Fraction of the gap that is closed each tick, large so that a short episode shows it."""
 DRIFT = 0.001
-"""What the robot turns less than the policy's rate says each tick [rad]."""
+"""Turn per tick by which the robot lags behind the policy's rate [rad]."""
 
 
 def labels(rates):
@@ -53,7 +53,7 @@ class Turning(Policy):
 
 
 def test_the_measured_heading_is_that_of_the_state():
-    """Whatever roll and pitch are, all around."""
+    """Headings all around, for any roll and pitch."""
     wanted = torch.linspace(-3.1, 3.1, 9, dtype=torch.float64)
     assert torch.allclose(measured_yaw(state_of(wanted)), wanted, atol=1e-6)
 

@@ -14,7 +14,8 @@ import torch
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.policies import Observation, PolicyUnavailable
-from arena_newton.policies.remote.arena_client import MAX_CHUNK, MAX_FAILURES, TOKEN_VARIABLE, RemotePolicy
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK
+from arena_newton.policies.remote.arena_client import MAX_FAILURES, TOKEN_VARIABLE, RemotePolicy
 
 CHUNK = 4
 
@@ -94,7 +95,7 @@ class Handler(BaseHTTPRequestHandler):
         if kind == "short":
             rows = rows[:2]
         if kind == "long":
-            rows = rows * (MAX_CHUNK // CHUNK + 1)
+            rows = rows * (LONGEST_CHUNK // CHUNK + 1)
         reply = {"action": rows[0], "action_chunk": rows, "chunk_size": len(rows)}
         if kind == "empty":
             reply = {"action_chunk": []}
@@ -197,12 +198,12 @@ def test_single_action(server, policy):
     ("kind", "text"),
     [
         ("nan", "is nan, expected a finite number"),
-        ("39", "39 numbers, expected 40"),
+        ("39", "39], expected [n, 40]"),
         ("words", "not a number"),
         ("500", "status 500, CUDA out of memory"),
         ("text", "not JSON"),
         ("empty", "neither action_chunk nor action"),
-        ("long", "a chunk of 4100 actions, expected at most 4096"),
+        ("long", "[4100, 40], expected [n, 40] with n of 1 to 4096"),
         ("escapes", "/infer: status 500, red back "),
         ("hangs up", "tried 3 times"),
     ],

@@ -1,4 +1,4 @@
-"""What docs/policies.md says is so: its tables, its server, its policy in Python."""
+"""Statements of docs/policies.md hold: its tables, its server, its policy in Python."""
 
 import json
 import re
@@ -13,8 +13,8 @@ import torch
 from arena_newton import policies, tasks
 from arena_newton.env import STAND_ACTION
 from arena_newton.policies import Observation
+from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK
 from arena_newton.policies.remote.arena_client import (
-    MAX_CHUNK,
     MAX_FAILURES,
     MAX_REPLY,
     ROBOT_TYPE,
@@ -81,7 +81,9 @@ def test_task_table():
 def test_numbers_in_the_text():
     """Limits, names and defaults are those of the code."""
     assert (
-        f"1 to {MAX_CHUNK} actions" in PLAIN and f"at most {MAX_REPLY >> 20} MiB" in PLAIN and TOKEN_VARIABLE in PLAIN
+        f"1 to {LONGEST_CHUNK} actions" in PLAIN
+        and f"at most {MAX_REPLY >> 20} MiB" in PLAIN
+        and TOKEN_VARIABLE in PLAIN
     )
     assert f"| {MAX_FAILURES} requests in a row" in PLAIN and f'`"{ROBOT_TYPE}"`' in PLAIN
     policy = RemotePolicy("http://host")

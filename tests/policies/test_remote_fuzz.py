@@ -224,7 +224,7 @@ def test_broken_replies_are_an_error_of_their_world(mutants):
 
 
 def test_broken_replies_to_the_first_request_are_refused(mutants):
-    """Whatever answers the first request is a policy server, or one line."""
+    """An answer to the first request is a policy server's, or one line."""
     cases = [
         *status_lines(),
         *headers(),

@@ -99,7 +99,7 @@ def play(policy, seeds, worlds):
 
 
 def run(server, worlds, seeds=SEEDS, loop=play, **options):
-    """How the episodes end, by seed, and all that the server saw, by seed and step, to the last bit."""
+    """Endings of the episodes by seed, and all that the server saw, by seed and step, to the last bit."""
     server.seen = {}
     policy = RemotePolicy(f"http://127.0.0.1:{server.server_port}", timeout=20.0, retries=3, backoff=0.01, **options)
     policy.needs_image = False

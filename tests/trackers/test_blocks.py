@@ -78,7 +78,7 @@ def test_many_rows_are_divided_among_threads(monkeypatch, worlds):
 
 
 def test_a_module_that_cannot_be_compiled_is_refused(monkeypatch):
-    """Where exporter or runtime fail, the first tick ends in one line."""
+    """A failing exporter or runtime ends the first tick in one line."""
     monkeypatch.setattr(torch.onnx, "export", lambda *a, **k: 1 / 0)
     with pytest.raises(InputError, match=r"cannot run in ONNX Runtime \(ZeroDivisionError: division by zero\)"):
         outputs(mlp(451, 64, 29), torch.randn(20, 451))
@@ -98,7 +98,7 @@ class OnHost(torch.nn.Module):
 
 
 def test_network_that_mixes_positions():
-    """Where no block size keeps a row's bits, rows run one at a time and still do not depend on each other."""
+    """Rows of a network for which no block size keeps their bits run one at a time and do not depend on each other."""
     network = OnHost(lambda x: 1e-3 * torch.arange(len(x))[:, None])
     rows = torch.randn(20, 8)
     assert BlockRunner(network, 8, 20).plan() == (1, False)

@@ -406,7 +406,7 @@ def test_the_chart_shows_each_verdict(tmp_path):
 
 
 def test_without_matplotlib_nothing_is_drawn(tmp_path, monkeypatch):
-    """Where the plots extra is absent, one line says what to install."""
+    """An absent plots extra is one line that says what to install."""
     monkeypatch.setattr(chart.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"chart.png: needs matplotlib: install `arena-newton\[plots\]`"):
         chart.chart([_result("ours", "twist2", False, 0)], tmp_path / "chart.png")

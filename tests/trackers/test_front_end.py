@@ -1,4 +1,4 @@
-"""What training and deployment share about front ends."""
+"""Front ends, which training and deployment share."""
 
 import pytest
 import torch
@@ -86,7 +86,7 @@ def test_action_forms():
 
 @pytest.mark.parametrize("name", ["twist2", "sonic"])
 def test_symmetric_weights_answer_the_mean_of_both_ways(name):
-    """What is deployed is the mean of the network's action and the mirrored action of the mirrored observation."""
+    """A deployed action is the mean of the network's and the mirrored one of the mirrored observation."""
     weights = weights_file.load(base.weights_path(name), name)
     tracker = trackers.get(name)
     tracker.bind(4)

@@ -46,7 +46,7 @@ def test_same_operators(tmp_path):
 
 
 def test_torch_modules_run_the_rows_of_a_gpu(tmp_path):
-    """What is converted for a GPU computes what the session does; back on the CPU the session runs again."""
+    """A network converted for a GPU computes as the session does; back on the CPU the session runs again."""
     session = onnx_session.OnnxSession(twist2_like(tmp_path / "a.onnx"), in_width=1432, out_width=29)
     x = torch.randn(5, 1432)
     expected = session(x)
@@ -184,7 +184,7 @@ def padded(b: Builder) -> None:
 
 @pytest.mark.parametrize("graph", [outer, doubled, gathered, padded])
 def test_graphs_that_would_take_memory(tmp_path, graph):
-    """What an operator makes is known before it makes it: a small file cannot ask for gigabytes."""
+    """Sizes of an operator's result are known before it is made: a small file cannot ask for gigabytes."""
     b = Builder()
     graph(b)
     path = b.save(tmp_path / "bomb.onnx", 12, 4)

@@ -52,7 +52,7 @@ def inputs(seed: int, worlds: int):
 
 @pytest.mark.parametrize("interface", ["twist2", "sonic"])
 def test_round_trip(files, interface):
-    """What was saved is loaded: tensors, action form, drive, physics, card; the file is at most 8 MB."""
+    """A saved file is loaded as it was: tensors, action form, drive, physics, card; it is at most 8 MB."""
     path = files / f"{interface}.safetensors"
     saved, loaded = trained(interface), weights_file.load(path, interface)
     x = torch.randn(3, saved.network.obs_width)

@@ -1,4 +1,4 @@
-"""How much the fused calls of `onnx_mlp` save under a CUDA graph: `python tests/trackers/time_fused.py FILE.onnx`."""
+"""Time that fused calls of `onnx_mlp` save under a CUDA graph: `python tests/trackers/time_fused.py FILE.onnx`."""
 
 import statistics
 import sys

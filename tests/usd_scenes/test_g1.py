@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from arena_newton.robot.g1 import HAND_JOINTS, MUJOCO_JOINTS
+from arena_newton.tasks.base import SCENES
+
+PATH = SCENES / "g1" / "g1.usda"
 
 ORACLE = Path(__file__).parents[2] / ".." / "shared" / "reference" / "g1"
 WITH_HANDS = ORACLE / "g1_sim2sim_29dof_with_hands.xml"
@@ -119,8 +122,6 @@ POSTURES = {
 def _stage(hands: str = "dex3"):
     from pxr import Usd
 
-    from arena_newton.usd_scenes.g1.build import PATH
-
     stage = Usd.Stage.Open(str(PATH))
     stage.SetEditTarget(stage.GetSessionLayer())  # the file's own layer is every other test's too
     stage.GetDefaultPrim().GetVariantSet("hands").SetVariantSelection(hands)
@@ -189,17 +190,15 @@ def _same_mass(mine, oracle) -> None:
 
 def test_layer_is_what_the_builder_writes(tmp_path):
     """The committed g1.usda is the builder's output, byte for byte."""
-    from arena_newton.usd_scenes.g1.build import PATH, build
+    from scene_builders.g1 import build
 
-    build(tmp_path / "g1.usda")
+    build(tmp_path)
     assert (tmp_path / "g1.usda").read_text() == PATH.read_text()
 
 
 def test_layer_states_units_variants_and_no_drives():
     """Metres, kilograms, z up, default prim /G1, two hands variants, no drives, no asset paths."""
     from pxr import UsdGeom, UsdPhysics
-
-    from arena_newton.usd_scenes.g1.build import PATH
 
     stage = _stage()
     assert str(stage.GetDefaultPrim().GetPath()) == "/G1"

@@ -8,8 +8,8 @@ from arena_newton import rule_sets, tasks
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
 from arena_newton.robot import g1
-from arena_newton.usd_scenes.build import build_all, parts
-from arena_newton.usd_scenes.lab.build import BALL_RADIUS, PARKED, SUPPORTS
+from scene_builders.__main__ import build_all, main, parts
+from scene_builders.lab import BALL_RADIUS, PARKED, SUPPORTS
 
 RATE = g1.PhysicsRate(dt=0.005, substeps=4)
 _LOADED: dict[str, object] = {}
@@ -58,12 +58,18 @@ def test_the_lab_is_built_but_is_no_task():
     assert "lab" not in tasks.names()
 
 
+def test_a_part_that_nobody_builds_is_one_line(capsys):
+    """An unknown name is code 2 and one line that names the parts."""
+    assert main(["tennis"]) == 2
+    assert capsys.readouterr().err.startswith("error: unknown part 'tennis'; parts are textures, g1, football,")
+
+
 def test_committed_layer_is_what_the_author_writes(tmp_path):
     """The committed scene is the author's output, byte for byte."""
     from arena_newton.physics.scene import scene_path
 
     (written,) = build_all(tmp_path, ["lab"])
-    assert written.read_text() == scene_path("lab").read_text()
+    assert (written / "scene.usda").read_text() == scene_path("lab").read_text()
 
 
 def test_base_has_no_ball_and_few_geoms():

@@ -1,7 +1,6 @@
 """The football, two-desk and box scenes: what the layers say and how their things behave in MuJoCo."""
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +8,8 @@ import pytest
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.physics.scene import Scene, load_scene
-from arena_newton.usd_scenes import author, rooms
-from arena_newton.usd_scenes.build import FOLDER, build_all
-from arena_newton.usd_scenes.patterns import PATTERNS
-from arena_newton.usd_scenes.textures import TEXTURES, write_all
+from scene_builders import author, patterns, rooms, textures
+from scene_builders.__main__ import build_all
 
 SCENES = tuple(name for name in tasks.names() if tasks.get(name).suite == "HOI")
 
@@ -218,11 +215,11 @@ def test_stocked_decks_leave_the_second_one_empty():
 
 def test_layers_are_what_their_authors_write(tmp_path):
     """Building again gives the stored scenes, variants and textures, byte for byte."""
-    build_all(tmp_path, ["textures", *tasks.names()])
+    build_all(tmp_path, ["textures", "patterns", *tasks.names()])
     files = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file())
-    assert len(files) >= len(TEXTURES) + 2 * len(tasks.names())
+    assert len(files) >= len(textures.TEXTURES) + 2 * len(tasks.names())
     for file in files:
-        assert (tmp_path / file).read_bytes() == (FOLDER / file).read_bytes(), file
+        assert (tmp_path / file).read_bytes() == (tasks.base.SCENES / file).read_bytes(), file
 
 
 def test_a_forgotten_or_misspelled_look_is_refused(tmp_path):
@@ -240,7 +237,7 @@ def test_textures_are_small(tmp_path):
     """Every texture is at most 256 pixels wide and high and 32 KiB long."""
     from PIL import Image
 
-    for path in (path for patterns in (TEXTURES, *PATTERNS.values()) for path in write_all(tmp_path, patterns)):
+    for path in (*textures.build(tmp_path), *patterns.build(tmp_path)):
         assert max(Image.open(path).size) <= 256
         assert path.stat().st_size <= 32 * 1024
 
@@ -248,5 +245,5 @@ def test_textures_are_small(tmp_path):
 def test_scenes_name_no_path_of_a_machine():
     """The stored layers contain relative asset paths only."""
     for task in tasks.names():
-        for layer in Path(FOLDER / task).rglob("*.usda"):
+        for layer in (tasks.base.SCENES / task).rglob("*.usda"):
             assert "@/" not in layer.read_text(), layer

@@ -12,8 +12,8 @@ from pxr import Sdf
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
+from arena_newton.tasks.base import SCENES
 from arena_newton.usd_scenes.__main__ import main
-from arena_newton.usd_scenes.build import FOLDER
 from arena_newton.usd_scenes.validate import check, layers, task_of, validate
 
 AUTHORING = Path(__file__).parents[2] / "docs" / "authoring.md"
@@ -38,7 +38,7 @@ def layer(folder: Path, body: str = "", *, task: str = "football", head: str = H
     """A user's layer on top of a task's scene; `body` may be written on one line."""
     path = folder / "my_room.usda"
     body = body.replace("{", "{\n").replace("}", "\n}\n")
-    scene = os.path.relpath(FOLDER / task / "scene.usda", folder.resolve())
+    scene = os.path.relpath(SCENES / task / "scene.usda", folder.resolve())
     path.write_text(head.replace("{scene}", scene) + body)
     return path
 
@@ -60,7 +60,7 @@ def only(path: Path, *words: str) -> None:
 @pytest.mark.parametrize("task", tasks.names())
 def test_own_scenes_and_variants_are_sound(task):
     """Every scene and variant of the project passes."""
-    files = [FOLDER / task / "scene.usda", *(FOLDER / task / "variants").glob("*.usda")]
+    files = [SCENES / task / "scene.usda", *(SCENES / task / "variants").glob("*.usda")]
     assert len(files) > 1
     for file in files:
         assert texts(file) == []
@@ -328,7 +328,7 @@ def test_layers_lists_every_file_of_the_scene(tmp_path):
     assert texts(path) == []
     found = layers(path)
     assert found[0] == path and len(set(found)) == len(found)
-    folder = FOLDER.resolve()
+    folder = SCENES.resolve()
     wanted = {
         folder / "football" / "scene.usda",
         folder / "g1" / "g1.usda",
@@ -425,7 +425,7 @@ def test_snippets_of_the_authoring_guide_are_usd(tmp_path, number):
     if not text.startswith("#usda"):
         Sdf.Layer.CreateAnonymous(".usda").ImportFromString(f'#usda 1.0\nover "World"\n{{\n{text}\n}}\n')
         return
-    (tmp_path / "usd_scenes").symlink_to(FOLDER.resolve())
+    (tmp_path / "usd_scenes").symlink_to(SCENES.resolve())
     (tmp_path / "rooms").mkdir()
     path = tmp_path / "rooms" / "my_room.usda"
     path.write_text(text)
@@ -464,7 +464,6 @@ def test_command_line_prints_a_line_per_problem(tmp_path, capsys):
     [
         ["validate", "football", "--task", "tennis"],
         ["validate", "no_such.usda"],
-        ["build", "tennis"],
         ["preview", "--size", "3"],
         ["preview", "/dev/zero"],
         ["validate", "/dev/zero"],

@@ -232,7 +232,7 @@ def test_a_robot_that_changes_all_over_is_summed_up(written, once):
 
 
 def test_a_skeleton_lists_what_base_needs(written):
-    """What only one variant of the scene has is not listed as needed."""
+    """Prims of one variant of the scene alone are not listed as needed."""
     text = written().read_text()
     assert "/World/Ball (body)" in text and "Distractor" not in text
 

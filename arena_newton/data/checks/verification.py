@@ -19,9 +19,11 @@ from tqdm import tqdm
 
 from arena_newton import tasks
 from arena_newton.data.checks.video_checks import CameraVideos, DatasetMismatch, check_videos
+from arena_newton.data.datasets.look_films import file_hash
 from arena_newton.data.datasets.row_statistics import aggregated, quantile_name, row_statistics
 from arena_newton.data.readers.dataset_files import DatasetFiles, EpisodeRow, read_json
 from arena_newton.data.readers.label_protocols import encode_v4
+from arena_newton.data.readers.looks import LOOKS_FOLDER, dataset_looks
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened, vision
 from arena_newton.data.recording.image_statistics import QUANTILES, VALUES, statistics
 from arena_newton.data.recording.layouts import (
@@ -33,6 +35,7 @@ from arena_newton.data.recording.layouts import (
     described_slots,
     modality,
 )
+from arena_newton.data.recording.source_videos import SourceVideo, check_film, source_looks
 from arena_newton.errors import InputError
 from arena_newton.files.text import counted
 from arena_newton.robot import g1
@@ -132,11 +135,33 @@ def _verified(files: DatasetFiles, recorded: Sequence[EpisodeFile], jobs: int) -
             bar.update(decoded - bar.n)
 
         total = check_videos(files, cameras, jobs=jobs, progress=progress)
+    _check_looks(subject, sources)
     against = f"equal to {counted(len(sources), 'recorded episode')}" if sources else (
         "not compared with recordings (--recordings names them)"
     )  # fmt: skip
     what = f"{counted(files.episodes, 'episode')}, {files.frames} rows, {counted(total, 'decoded frame')}"
     return [*warnings, f"{files.root}: {what}: sound, {against}"]
+
+
+def _check_looks(subject: _Subject, sources: Mapping[int, EpisodeFile]) -> None:
+    """Films of looks: their content by hash, size and number of frames, and against the recording's."""
+    files = subject.files
+    shape = files.features.get(subject.kind.image_key("front"), {}).get("shape")
+    if not isinstance(shape, list):
+        return
+    for row, film in zip(files.episode_rows, dataset_looks(files.root, files.episodes), strict=True):
+        recorded = source_looks(sources[row.index]) if row.index in sources else None
+        own = None if film is None else (film.looks, film.sha256)
+        if row.index in sources and own != (None if recorded is None else (recorded[0], file_hash(recorded[1]))):
+            path = sources[row.index].path
+            raise DatasetMismatch(files.root / LOOKS_FOLDER, f"are not the looks of {path}", episode=row.index)
+        if film is None:
+            continue
+        if film.sha256 != file_hash(film.path):
+            raise DatasetMismatch(film.path, "is not the film of looks.json (another sha256)", episode=row.index)
+        frames, fps = film.looks.frames(row.length), files.fps / film.looks.stride
+        video = SourceVideo(film.path, shape[1], shape[0], fps, {"vcodec": "h264"}, np.zeros(0, np.int64))
+        check_film(video, frames, f"{row.length} rows have {frames}")
 
 
 def _subject(files: DatasetFiles) -> _Subject:
@@ -201,12 +226,12 @@ def _check_features(subject: _Subject) -> None:
             )
     protocol = files.info.get("vla_protocol")
     if subject.kind.name == "arena" and (subject.arena is not None or protocol is not None):
-        told = protocol if isinstance(protocol, dict) else {}
-        wanted_protocol = described_protocol(subject.labels, str(told.get("backend_source", "")).split("+"))
+        declared = protocol if isinstance(protocol, dict) else {}
+        wanted_protocol = described_protocol(subject.labels, str(declared.get("backend_source", "")).split("+"))
         keys = list(wanted_protocol) if subject.arena is not None else ["version"]
         for name in keys:
-            if told.get(name) != wanted_protocol[name]:
-                shown = f"is {str(told.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
+            if declared.get(name) != wanted_protocol[name]:
+                shown = f"is {str(declared.get(name))[:80]!r}, expected {wanted_protocol[name]!r}"
                 raise DatasetMismatch(subject.info, f"vla_protocol: {name} {shown}")
     if subject.arena is not None:
         if subject.kind.name == "arena" and subject.arena.get("slots") != described_slots(subject.labels):

@@ -18,6 +18,7 @@ import pyarrow.compute
 import pyarrow.parquet
 from tqdm import tqdm
 
+from arena_newton.data.datasets.look_films import write_looks
 from arena_newton.data.datasets.row_statistics import HAND_NAME, aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import (
     DATA_PATH,
@@ -27,10 +28,11 @@ from arena_newton.data.readers.dataset_files import (
     VideoPart,
     read_json,
 )
+from arena_newton.data.readers.looks import Looks, dataset_looks
 from arena_newton.data.recording.layouts import REFERENCE_SOURCES
 from arena_newton.errors import InputError
 from arena_newton.files.limits import MIB
-from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.own_files import replace_atomically, write_json
 
 __all__ = ["Selection", "check_alike", "content", "described", "write_selection"]
 
@@ -175,9 +177,9 @@ class _Pictures:
             raise InputError(f"{where}: cannot be copied ({type(error).__name__}: {error})") from error
         chunk, number = divmod(self.number, self.chunk_files)
         first, self.frames, self.size = self.frames, self.frames + part.frames, self.size + size
-        told: dict[str, object] = {"chunk_index": chunk, "file_index": number}
-        told |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
-        return {f"videos/{self.key}/{name}": value for name, value in told.items()}
+        facts: dict[str, object] = {"chunk_index": chunk, "file_index": number}
+        facts |= {"from_timestamp": first / self.fps, "to_timestamp": self.frames / self.fps}
+        return {f"videos/{self.key}/{name}": value for name, value in facts.items()}
 
     def _packets(
         self, source: av.container.InputContainer, stream: av.VideoStream, part: VideoPart, where: str
@@ -267,6 +269,12 @@ def write_selection(selections: Sequence[Selection], root: Path) -> None:
             pictures.close()
         av.logging.set_libav_level(av.logging.INFO)
     _write_meta(selections, root, info, rows, list(tasks), data.rows)
+    films: list[tuple[Looks, Path] | None] = []
+    for selection in selections:
+        known = dataset_looks(selection.files.root, selection.files.episodes)
+        chosen = (known[number] for number in selection.episodes)
+        films += [None if film is None else (film.looks, film.path) for film in chosen]
+    write_looks(root, films)
 
 
 def _size(info: Mapping[str, object], name: str, default: int) -> int:
@@ -345,7 +353,7 @@ def _write_meta(
     elif source.schema.metadata:
         written = written.replace_schema_metadata(_pandas(source.schema.metadata, len(tasks)))
     _write_table(meta / "tasks.parquet", written)
-    _write_json(meta / "stats.json", _statistics(first, rows), sort=True)
+    write_json(meta / "stats.json", _statistics(first, rows), sort=True)
     features = {key: dict(feature) for key, feature in first.features.items()}
     for key, feature in features.items():
         known = [s.files.features[key].get("info") for s in selections]
@@ -358,7 +366,7 @@ def _write_meta(
         info.pop(name, None)
         if block is not None:
             info[name] = block
-    _write_json(meta / "info.json", info)
+    write_json(meta / "info.json", info)
     modalities = [s.files.root / MODALITY for s in selections]
     if all(path.is_file() for path in modalities) and len({json.dumps(read_json(path)) for path in modalities}) == 1:
         shutil.copyfile(modalities[0], root / MODALITY)
@@ -414,8 +422,8 @@ def _protocol(selections: Sequence[Selection]) -> dict[str, object] | None:
         same["backend_source"] = "+".join(dict.fromkeys(backends))
     for key in (f"{name}_reference_source" for name in REFERENCE_SOURCES):
         if any(key in block for block in known):  # a set of another tracker names none
-            said = [part for block in known for part in str(block.get(key) or "").split("+") if part]
-            same[key] = "+".join(dict.fromkeys(said)) or None
+            sources = [part for block in known for part in str(block.get(key) or "").split("+") if part]
+            same[key] = "+".join(dict.fromkeys(sources)) or None
     return same
 
 
@@ -459,11 +467,6 @@ def _write_table(path: Path, *tables: pyarrow.Table) -> None:
     ):
         for table in tables:
             writer.write_table(table.cast(tables[0].schema))
-
-
-def _write_json(path: Path, value: object, *, sort: bool = False) -> None:
-    with replace_atomically(path) as file:
-        file.write(json.dumps(value, indent=4, sort_keys=sort, ensure_ascii=False).encode())
 
 
 def content(files: DatasetFiles, row: EpisodeRow) -> bytes:

@@ -19,7 +19,7 @@ import av
 import numpy as np
 from tqdm import tqdm
 
-from arena_newton.data.recording.episode import CAMERAS, VIDEO_FOLDER, episode_files, vision, write_episode
+from arena_newton.data.recording.episode import CAMERAS, VIDEO_FOLDER, episode_files, looks_film, vision, write_episode
 from arena_newton.data.recording.image_statistics import VALUES, add_picture
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import link, new_folder
@@ -215,13 +215,15 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
     videos = {camera: _video(file, arrays, camera) for camera in cameras}
     if stays.all():
         link(file, folder / file.name)
-        for video in videos.values():
-            link(video, folder / VIDEO_FOLDER / video.name)
+        for camera, video in videos.items():
+            for film in (video, *([looks_film(video)] if f"arena_{vision(camera, 'looks')}" in arrays else [])):
+                link(film, folder / VIDEO_FOLDER / film.name)
         return found, stays
     kept = {name: array[stays] if _is_rows(name, array, len(stays)) else array for name, array in arrays.items()}
     rows = int(stays.sum())
     kept["num_frames"] = np.asarray(np.int64(rows))
     for camera, video in videos.items():
+        kept.pop(f"arena_{vision(camera, 'looks')}", None)  # whose frames are of rows that are gone
         index = vision(camera, "frame_indices")
         frames = arrays[index][stays] if index in arrays else np.flatnonzero(stays)
         target = folder / VIDEO_FOLDER / video.name
@@ -229,8 +231,8 @@ def clean_episode(file: Path, folder: Path, options: CleanOptions) -> tuple[dict
         kept |= {index: np.arange(rows), vision(camera, "rgb_video_num_frames"): np.asarray(np.int64(rows))} | changed
     counts = {name: int(broken.sum()) for name, broken in found.items()}
     source = hashlib.sha256(read_bytes(file, MAX_BYTES)).hexdigest()
-    told = {"dropped": int((~stays).sum()), "rules": counts, "source": file.name, "sha256": source}
-    kept["arena_cleaned"] = np.asarray(np.str_(json.dumps(told, sort_keys=True)))
+    facts = {"dropped": int((~stays).sum()), "rules": counts, "source": file.name, "sha256": source}
+    kept["arena_cleaned"] = np.asarray(np.str_(json.dumps(facts, sort_keys=True)))
     kept["arena_source_rows"] = arrays.get("arena_source_rows", np.arange(len(stays)))[stays]
     write_episode(folder / file.name, kept)
     return found, stays

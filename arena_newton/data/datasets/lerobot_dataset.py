@@ -29,20 +29,22 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from arena_newton import __version__
+from arena_newton.data.datasets.look_films import write_looks
 from arena_newton.data.datasets.row_statistics import row_statistics
 from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.data.recording.episode import EpisodeFile, episode_files, opened
 from arena_newton.data.recording.image_statistics import statistics
 from arena_newton.data.recording.layouts import Layout, described_protocol, described_slots, layout, modality
-from arena_newton.data.recording.source_videos import SourceVideo, source_video
+from arena_newton.data.recording.source_videos import SourceVideo, source_looks, source_video
 from arena_newton.errors import InputError
 from arena_newton.files.new_folder import new_folder
-from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.own_files import write_json
 from arena_newton.files.text import counted
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
     from arena_newton.data.datasets.data_options import BuildOptions
+    from arena_newton.data.readers.looks import Looks
 
 __all__ = ["LEROBOT", "SCHEMA", "Chosen", "FinishedVideos", "build", "choose", "write_dataset"]
 
@@ -77,6 +79,8 @@ class Chosen:
     fps: int
     left_out: int
     """Episodes that did not succeed."""
+    looks: tuple[tuple[Looks, Path] | None, ...] = ()
+    """Looks of each episode's head camera and their film."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -206,7 +210,8 @@ def choose(
         if name in seen:
             raise InputError(f"{episode.path}: is the same episode as {seen[name].path} ({' '.join(map(str, name))})")
         seen[name] = episode
-    return Chosen(tuple(episodes), tuple(videos), rate, len(every) - len(episodes))
+    looks = tuple(map(source_looks, episodes)) if "front" in wanted else ()
+    return Chosen(tuple(episodes), tuple(videos), rate, len(every) - len(episodes), looks)
 
 
 def _rate(episode: EpisodeFile) -> int:
@@ -388,7 +393,7 @@ def _finish(chosen: Chosen, root: Path, *, kind: Layout, labels: str) -> None:
     # Averages of zeros and ones are again zeros and ones up to rounding, which is not wanted here.
     for key, columns in names.items():
         stats[key] = _clean_hands(stats[key], columns)
-    _write_json(meta / "stats.json", stats, sort=True)
+    write_json(meta / "stats.json", stats, sort=True)
     info = read_json(meta / "info.json")
     features = info["features"]
     assert isinstance(features, dict)
@@ -399,8 +404,9 @@ def _finish(chosen: Chosen, root: Path, *, kind: Layout, labels: str) -> None:
         trackers = list(dict.fromkeys(episode.text("arena_tracker") for episode in chosen.episodes))
         info["vla_protocol"] = described_protocol(labels, trackers)
     info["arena"] = _origin(chosen, kind, labels)
-    _write_json(meta / "info.json", info)
-    _write_json(meta / "modality.json", modality(kind, labels, chosen.cameras))
+    write_json(meta / "info.json", info)
+    write_json(meta / "modality.json", modality(kind, labels, chosen.cameras))
+    write_looks(root, chosen.looks)
     rights = (meta / "info.json").stat().st_mode & 0o777
     for file in root.rglob("*"):
         if file.is_file():
@@ -449,8 +455,3 @@ def _origin(chosen: Chosen, kind: Layout, labels: str) -> dict[str, object]:
         "configurations": dict(sorted(configurations.items())),
         "episodes": episodes,
     }
-
-
-def _write_json(path: Path, value: object, *, sort: bool = False) -> None:
-    with replace_atomically(path) as file:
-        file.write(json.dumps(value, indent=4, sort_keys=sort, ensure_ascii=False).encode())

@@ -148,6 +148,7 @@ def _split_recordings(folders: Sequence[Path], options: SplitOptions, train: Pat
             for episode in side:
                 link(episode.path, folder / episode.path.name)
                 for camera in episode.cameras:
-                    video = episode.video(camera)
-                    link(video, folder / VIDEO_FOLDER / video.name)
+                    looks = episode.looks(camera)
+                    for film in (episode.video(camera), *([looks[1]] if looks else [])):
+                        link(film, folder / VIDEO_FOLDER / film.name)
     return len(sides[0]), len(sides[1])

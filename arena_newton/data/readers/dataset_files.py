@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ import pyarrow.parquet
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits
-from arena_newton.files.untrusted_files import check_size, read_bytes
+from arena_newton.files.stored_json import read_object
+from arena_newton.files.untrusted_files import check_size
 
 __all__ = ["CODEBASE_VERSION", "DatasetFiles", "EpisodeRow", "VideoPart", "read_json"]
 
@@ -41,13 +41,7 @@ def read_json(path: Path) -> dict[str, object]:
     Raises:
         InputError: The file is absent, too large or no JSON object.
     """
-    try:
-        value = json.loads(read_bytes(path, JSON_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({type(error).__name__})") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: is no JSON object")
-    return value
+    return read_object(path, JSON_BYTES)
 
 
 @dataclass(frozen=True)

@@ -140,8 +140,8 @@ class DatasetActions:
         if block is None:
             return found
         version = block.get("version") if isinstance(block, dict) else None
-        said = {"3.1": "v3.1", "v3.1": "v3.1", "4": "v4", "4.0": "v4", "v4": "v4"}.get(str(version))
-        if said != found:
+        declared = {"3.1": "v3.1", "v3.1": "v3.1", "4": "v4", "4.0": "v4", "v4": "v4"}.get(str(version))
+        if declared != found:
             raise InputError(
                 f"{self.where}: vla_protocol has version {str(version)[:40]!r}, robot_type {kind} is of {found}"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +15,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton.data.recording.encoding import Filming, FilmThreads, Pictured, Reel
-from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, vision, write_episode
+from arena_newton.data.recording.encoder_pool import EncoderPool
+from arena_newton.data.recording.encoding import EncoderThreads, Pictured, VideoEncoder, VideoStream
+from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
 from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
-from arena_newton.data.recording.film_pool import FilmPool
+from arena_newton.data.recording.look_planes import LookPlanes
 from arena_newton.errors import ArenaError
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
@@ -28,6 +30,7 @@ from arena_newton.robot.rotations import matrix_from_quat, quat_apply, quat_conj
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
+    from arena_newton.data.readers.looks import Looks
     from arena_newton.interfaces import EpisodeResult, Observation, World
     from arena_newton.pictures.settings import CameraConfig
 
@@ -35,6 +38,8 @@ __all__ = ["DemonstrationRecorder", "RecordedEpisode", "SavedEpisode", "episode_
 
 FPS = round(1 / g1.TICK)
 """Frames per second: one a tick."""
+LOOKS = "looks"
+"""Name of the film of looks among those of the cameras; it is of the head camera's pictures."""
 WAITING_EPISODES = 8
 """Ended episodes whose files are not written yet, beside one per world: more of them wait for the disk."""
 
@@ -98,8 +103,9 @@ class _Stream:
     """Whoever makes its films."""
     initial: dict[str, np.ndarray]
     """Fields of the reset."""
-    reels: dict[str, Reel]
-    """Its films by camera."""
+    videos: dict[str, VideoStream]
+    """Its films by camera, and that of its looks."""
+    looks: Looks | None = None
     heading: float = 0.0
     rows: list[np.ndarray] = field(default_factory=list)
     """Packed rows: the beginning of a tick, then what was executed in it."""
@@ -125,6 +131,7 @@ class DemonstrationRecorder(Recorder):
         *,
         cameras: Mapping[str, CameraConfig] | None = None,
         depth: bool = False,
+        looks: int = 0,
         seeds: str | None = None,
         only_success: bool = False,
         facts: Mapping[str, object] | None = None,
@@ -139,6 +146,7 @@ class DemonstrationRecorder(Recorder):
             folder: Where `<label>.npz` and `videos/` are written.
             cameras: Camera as datasets name it (`episode.CAMERAS`) → its picture; none: states and actions only.
             depth: Record the depth of each picture too, float16 [m].
+            looks: Second lights of an episode (`readers.looks`), with the camera `front`; 0: no looks.
             seeds: Range of the seeds, where the seed itself does not tell (`seeding.TELEOPERATION`).
             only_success: Write successes only.
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
@@ -149,6 +157,8 @@ class DemonstrationRecorder(Recorder):
             finishing: Makes the arrays that are written from those that were recorded.
         """
         self.folder, self.cameras, self.depth = Path(folder), dict(cameras or {}), depth
+        self.looks = looks
+        self._planes: LookPlanes | None = None
         self.seeds, self.only_success, self.finishing = seeds, only_success, finishing
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)
         self._env: World | None = None
@@ -157,12 +167,14 @@ class DemonstrationRecorder(Recorder):
         """Camera whose pictures the policy sees too."""
         self._streams: dict[int, _Stream] = {}
         self._acting: list[int] = []
-        self._reels: dict[str, list[Reel]] = {}
+        self._videos: dict[str, list[VideoStream]] = {}
         """The films of the worlds that act, by camera."""
         self._chosen: torch.Tensor | None = None
         """The worlds that act, where not all do."""
         self._before: torch.Tensor | None = None
-        self._filming: Filming = FilmPool(processes, threads) if processes and self.cameras else FilmThreads(threads)
+        self._encoder: VideoEncoder = (
+            EncoderPool(processes, threads) if processes and self.cameras else EncoderThreads(threads)
+        )
         self._saved: deque[SavedEpisode] = deque()
         self._ended = 0
 
@@ -178,12 +190,15 @@ class DemonstrationRecorder(Recorder):
         self._env = env
         self._described = env.describe()
         front = self.cameras.get("front")
-        # Depths of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
-        same = env.camera is not None and front == env.camera_config and not self.depth
+        # Surfaces of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
+        same = env.camera is not None and front == env.camera_config and not self.depth and not self.looks
         self._shared = "front" if same else None
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
         pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
-        self._filming.bind(pictured, torch.device(env.torch_device))
+        if self.looks:
+            self._planes = LookPlanes(env, self._views["front"], self.looks)
+            pictured[LOOKS] = dataclasses.replace(pictured["front"], depth=False)
+        self._encoder.bind(pictured, torch.device(env.torch_device))
         scene = env.scene
         self._bodies = {}
         for placed in env.spec.objects:
@@ -234,14 +249,19 @@ class DemonstrationRecorder(Recorder):
             # A reset puts things down at rest.
             for motion in ("linear", "angular"):
                 initial[f"episode_init_env_obj_{name}_{motion}_velocity"] = np.zeros(3, np.float32)
-        label, worker = episode_label(episode), self._filming.join()
-        reels = {}
+        label, worker = episode_label(episode), self._encoder.join()
+        videos = {}
         for name in self.cameras:
             video = self.folder / VIDEO_FOLDER / f"{label}_{name}_rgb.mp4"
             depth = self.folder / f"{label}_{name}_depth.raw{PARTIAL}"
-            reels[name] = self._filming.open(worker, video, depth, FPS)
-        self._streams[world] = _Stream(episode, worker, initial, reels)
-        self._reels = {}
+            videos[name] = self._encoder.open(worker, video, depth, FPS)
+        looks = None
+        if self._planes is not None:
+            looks = self._planes.begin(world, episode.episode_seed)
+            film = looks_film(videos["front"].video)
+            videos[LOOKS] = self._encoder.open(worker, film, film, FPS / looks.stride, lossless=True)
+        self._streams[world] = _Stream(episode, worker, initial, videos, looks)
+        self._videos = {}
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """Keep state, label and pictures of the worlds that act.
@@ -249,7 +269,7 @@ class DemonstrationRecorder(Recorder):
         Raises:
             OSError: A file could not be written, which the error names, or a process that encodes ended.
         """
-        self._filming.check()
+        self._encoder.check()
         mask = env.active & (env.tick >= 0)
         self._act([world for world in np.flatnonzero(mask).tolist() if world in self._streams])
         if not self._acting or observation is None:
@@ -265,13 +285,15 @@ class DemonstrationRecorder(Recorder):
                 stream.heading = float(self._heading[world])
         for name, camera in self._views.items():
             self._film(env, name, camera, mask, observation)
+            if name == "front" and self._planes is not None:
+                self._film_looks(self._planes)
 
     def _act(self, worlds: list[int]) -> None:
         """Set the worlds that act in this tick; the choice of films follows only where it changes."""
-        if worlds == self._acting and self._reels:
+        if worlds == self._acting and self._videos:
             return
         self._acting = worlds
-        self._reels = {name: [self._streams[world].reels[name] for world in worlds] for name in self.cameras}
+        self._videos = {name: [self._streams[world].videos[name] for world in worlds] for name in self.cameras}
         self._chosen = None
 
     def _film(self, env: World, name: str, camera: Camera, mask: np.ndarray, observation: Observation) -> None:
@@ -283,7 +305,14 @@ class DemonstrationRecorder(Recorder):
             env.render(camera, missing)
         pictures = self._taken(wp.to_torch(camera.image))
         depths = self._taken(camera.distance_picture()).half() if self.depth else None
-        self._filming.add(name, self._reels[name], pictures, depths)
+        self._encoder.add(name, self._videos[name], pictures, depths)
+
+    def _film_looks(self, planes: LookPlanes) -> None:
+        """Hand over the looks of the pictures that the head camera has just rendered, where a frame is due."""
+        streams = {world: self._streams[world] for world in self._acting}
+        due = [w for w, stream in streams.items() if stream.looks and not len(stream.rows) % stream.looks.stride]
+        if due:
+            self._encoder.add(LOOKS, [streams[world].videos[LOOKS] for world in due], planes.frames(due), None)
 
     def _taken(self, pictures: torch.Tensor) -> torch.Tensor:
         """Pictures of the worlds that act."""
@@ -305,7 +334,7 @@ class DemonstrationRecorder(Recorder):
         for world in self._acting:
             self._streams[world].rows.append(rows[world].copy())
         self._before = None
-        self._filming.check()  # the GPU has done what it was asked for: the pictures are there
+        self._encoder.check()  # the GPU has done what it was asked for: the pictures are there
 
     def finish(self, env: World, world: int, result: EpisodeResult) -> None:
         """Write the episode; one that ended as an error, or before its first action, leaves nothing.
@@ -317,19 +346,19 @@ class DemonstrationRecorder(Recorder):
         if stream is None:
             return
         self._ended += 1
-        self._reels = {}
+        self._videos = {}
         wanted = result.outcome == "success" or (not self.only_success and result.outcome != "error")
         if wanted and stream.rows:
             last = self._qpos[world].cpu().numpy().copy()
             fields = partial(self._fields, env, stream, result, last, self._described)
-            self._filming.finish(stream.worker, stream.reels, partial(self._save, stream, result, fields))
+            self._encoder.finish(stream.worker, stream.videos, partial(self._save, stream, result, fields))
         else:
             dropped = partial(self._saved.append, SavedEpisode(result, {}))
-            self._filming.discard(stream.worker, stream.reels, dropped)
-        self._filming.leave(stream.worker)
-        self._filming.check()
+            self._encoder.discard(stream.worker, stream.videos, dropped)
+        self._encoder.leave(stream.worker)
+        self._encoder.check()
         if self._ended - len(self._saved) > env.worlds + WAITING_EPISODES:
-            self._filming.wait()
+            self._encoder.wait()
 
     def _save(
         self,
@@ -347,13 +376,13 @@ class DemonstrationRecorder(Recorder):
             write_episode(path, fields(films))
         except BaseException:
             for name in made:
-                stream.reels[name].video.unlink(missing_ok=True)
+                stream.videos[name].video.unlink(missing_ok=True)
             raise
         finally:
             for name, facts in made.items():
                 if facts.depth_shape:
-                    stream.reels[name].depth.unlink(missing_ok=True)
-        files = {name: stream.reels[name].video for name in made}
+                    stream.videos[name].depth.unlink(missing_ok=True)
+        files = {name: stream.videos[name].video for name in made}
         self._saved.append(SavedEpisode(result, {"episode": path} | files))
 
     def saved(self, *, wait: bool = False) -> list[SavedEpisode]:
@@ -363,7 +392,7 @@ class DemonstrationRecorder(Recorder):
             wait: Until all that ended are written.
         """
         if wait:
-            self._filming.wait()
+            self._encoder.wait()
         found = [self._saved.popleft() for _ in range(len(self._saved))]
         self._ended -= len(found)
         return found
@@ -374,7 +403,7 @@ class DemonstrationRecorder(Recorder):
         Raises:
             OSError: A file could not be written, which the error names, or a process that encodes ended.
         """
-        self._filming.check()
+        self._encoder.check()
 
     def _fields(
         self,
@@ -440,9 +469,13 @@ class DemonstrationRecorder(Recorder):
         fields |= stream.initial
         fields["episode_object_seed"] = np.uint64(episode.object_seed)
         fields["episode_object_seed_source"] = np.str_("arena_episode_seed")
-        for name, film in films.items():
-            if film is not None:
-                fields |= _film_fields(name, stream.reels[name], film, rows)
+        looks = stream.looks
+        if looks is not None and (made := films.get(LOOKS)):
+            _check_frames(stream.videos[LOOKS], made, looks.frames(rows))
+            fields[f"arena_{vision('front', 'looks')}"] = np.str_(json.dumps(looks.plain()))
+        for name in self.cameras:
+            if (film := films[name]) is not None:
+                fields |= _film_fields(name, stream.videos[name], film, rows)
         fields |= {
             "arena_state": state,
             "arena_action": action,
@@ -474,16 +507,16 @@ class DemonstrationRecorder(Recorder):
     def close(self) -> None:
         """Drop what is unfinished; no partial file stays."""
         self._discard()
-        self._filming.close()
-        self._env, self._views = None, {}
+        self._encoder.close()
+        self._env, self._views, self._planes = None, {}, None
 
     def _discard(self) -> None:
-        self._filming.wait()
+        self._encoder.wait()
         for stream in self._streams.values():
-            self._filming.discard(stream.worker, stream.reels, lambda: None)
-            self._filming.leave(stream.worker)
-        self._filming.wait()
-        self._streams, self._acting, self._reels, self._before = {}, [], {}, None
+            self._encoder.discard(stream.worker, stream.videos, lambda: None)
+            self._encoder.leave(stream.worker)
+        self._encoder.wait()
+        self._streams, self._acting, self._videos, self._before = {}, [], {}, None
 
     def __enter__(self) -> DemonstrationRecorder:
         """The recorder itself."""
@@ -494,30 +527,34 @@ class DemonstrationRecorder(Recorder):
         self.close()
 
 
-def _film_fields(name: str, reel: Reel, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
+def _film_fields(name: str, stream: VideoStream, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
     """Fields of a camera's film in the file.
 
     Raises:
         ArenaError: The film has another number of pictures.
     """
-    if film.frames != rows:
-        raise ArenaError(f"{reel.video}: {film.frames} frames for {rows} rows")
+    _check_frames(stream, film, rows)
     codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0, "mbtree": 0}
     found: dict[str, np.ndarray | np.generic] = {
         vision(name, "storage_format"): np.str_("video_v1"),
         vision(name, "frame_indices"): np.arange(rows),
-        vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{reel.video.name}"),
+        vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{stream.video.name}"),
         vision(name, "rgb_video_fps"): np.float64(FPS),
         vision(name, "rgb_video_num_frames"): np.int64(film.frames),
     }
     if film.depth_shape:
         shape = (rows, *film.depth_shape)
-        found[vision(name, "depth")] = np.memmap(reel.depth, np.float16, "r", shape=shape)
+        found[vision(name, "depth")] = np.memmap(stream.depth, np.float16, "r", shape=shape)
     return found | {
         f"arena_{vision(name, 'size')}": np.array([film.width, film.height]),
         f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
         f"arena_{vision(name, 'histogram')}": film.histogram,
     }
+
+
+def _check_frames(stream: VideoStream, film: FilmFacts, frames: int) -> None:
+    if film.frames != frames:
+        raise ArenaError(f"{stream.video}: {film.frames} frames instead of {frames}")
 
 
 def _split(rows: Sequence[np.ndarray], widths: Sequence[int]) -> list[np.ndarray]:

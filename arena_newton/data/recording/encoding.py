@@ -4,7 +4,7 @@ An episode belongs to one worker, which does its jobs in their order: frame afte
 in slots of memory that were allocated once; where all are taken, whoever brings the next pictures waits. So memory is
 bounded, no frame is dropped, and a slow disk slows the simulation instead of failing it.
 
-Python's global lock lets few threads encode at once; `film_pool` does the same with processes.
+Python's global lock lets few threads encode at once; `encoder_pool` does the same with processes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from arena_newton.files.interrupts import Uninterrupted
 
 __all__ = [
     "Encoders",
-    "FilmThreads",
-    "Filming",
+    "EncoderThreads",
+    "VideoEncoder",
     "PictureSlot",
     "PictureSlots",
     "Pictured",
-    "Reel",
+    "VideoStream",
     "copy_pictures",
     "slots_of",
 ]
@@ -72,11 +72,11 @@ class Pictured:
 
 
 @dataclass(eq=False)
-class Reel:
+class VideoStream:
     """A film that others make: what its recorder knows of it."""
 
     number: int
-    """No other one of the same `Filming` has it."""
+    """No other one of the same `VideoEncoder` has it."""
     worker: int
     """Whoever makes the films of its episode."""
     video: Path
@@ -94,7 +94,7 @@ Finished = Callable[[Mapping[str, FilmFacts | None] | None], None]
 pictures has no facts."""
 
 
-class Filming(abc.ABC):
+class VideoEncoder(abc.ABC):
     """Makes the films of the episodes that are recorded at the same time, and then writes the episodes' files."""
 
     @abc.abstractmethod
@@ -110,29 +110,31 @@ class Filming(abc.ABC):
         """The episode brings no more pictures."""
 
     @abc.abstractmethod
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
-        """A film of an episode."""
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
+        """A film of an episode; `lossless` keeps every byte of its pictures."""
 
     @abc.abstractmethod
-    def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
+    def add(
+        self, camera: str, streams: Sequence[VideoStream], pictures: torch.Tensor, depths: torch.Tensor | None
+    ) -> None:
         """Append a picture to each film; waits where the workers are too far behind.
 
         Args:
             camera: Its name in `bind`.
-            reels: The films. A list that is given again must be the same one in content.
-            pictures: uint8, shape [len(reels), H, W, 3]; they may change afterwards.
-            depths: float16 [m], shape [len(reels), H, W].
+            streams: The films. A list that is given again must be the same one in content.
+            pictures: uint8, shape [len(streams), H, W, 3]; they may change afterwards.
+            depths: float16 [m], shape [len(streams), H, W].
 
         Raises:
             OSError: A worker ended.
         """
 
     @abc.abstractmethod
-    def finish(self, worker: int, reels: Mapping[str, Reel], then: Finished) -> None:
+    def finish(self, worker: int, streams: Mapping[str, VideoStream], then: Finished) -> None:
         """Finish an episode's films, and then do that; not necessarily at once, and in any thread."""
 
     @abc.abstractmethod
-    def discard(self, worker: int, reels: Mapping[str, Reel], then: Job) -> None:
+    def discard(self, worker: int, streams: Mapping[str, VideoStream], then: Job) -> None:
         """Drop an episode's films, and then do that."""
 
     @abc.abstractmethod
@@ -278,7 +280,7 @@ class PictureSlots:
                 self._changed.notify()
 
 
-class FilmThreads(Filming):
+class EncoderThreads(VideoEncoder):
     """Films that threads make; without a thread, whoever brings the pictures."""
 
     def __init__(self, threads: int):
@@ -305,56 +307,58 @@ class FilmThreads(Filming):
         """The episode brings no more pictures."""
         self._encoders.leave(worker)
 
-    def open(self, worker: int, video: Path, depth: Path, fps: float) -> Reel:
+    def open(self, worker: int, video: Path, depth: Path, fps: float, lossless: bool = False) -> VideoStream:
         """A film of an episode."""
         self._opened += 1
-        return Reel(self._opened, worker, video, depth, Film(video, depth, fps))
+        return VideoStream(self._opened, worker, video, depth, Film(video, depth, fps, lossless))
 
-    def add(self, camera: str, reels: Sequence[Reel], pictures: torch.Tensor, depths: torch.Tensor | None) -> None:
+    def add(
+        self, camera: str, streams: Sequence[VideoStream], pictures: torch.Tensor, depths: torch.Tensor | None
+    ) -> None:
         """Append a picture to each film; waits while all slots are taken."""
         slots, depth_slots = self._slots[camera]
-        slot = slots.take(len(reels))
+        slot = slots.take(len(streams))
         slot.fill(pictures)
         depth = None
         if depth_slots is not None and depths is not None:
-            depth = depth_slots.take(len(reels))
+            depth = depth_slots.take(len(streams))
             depth.fill(depths)
-        for row, reel in enumerate(reels):
-            self._encoders.submit(reel.worker, partial(self._encode, camera, reel, row, slot, depth))
+        for row, stream in enumerate(streams):
+            self._encoders.submit(stream.worker, partial(self._encode, camera, stream, row, slot, depth))
 
-    def _encode(self, camera: str, reel: Reel, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
+    def _encode(self, camera: str, stream: VideoStream, row: int, slot: PictureSlot, depth: PictureSlot | None) -> None:
         """A picture's encoding, in the episode's thread."""
         slots, depth_slots = self._slots[camera]
         try:
-            if not reel.broken and reel.film is not None:
-                reel.film.add(slot.picture(row), None if depth is None else depth.picture(row))
+            if not stream.broken and stream.film is not None:
+                stream.film.add(slot.picture(row), None if depth is None else depth.picture(row))
         except BaseException:
-            reel.broken = True
+            stream.broken = True
             raise
         finally:
             slots.release(slot)
             if depth is not None and depth_slots is not None:
                 depth_slots.release(depth)
 
-    def finish(self, worker: int, reels: Mapping[str, Reel], then: Finished) -> None:
+    def finish(self, worker: int, streams: Mapping[str, VideoStream], then: Finished) -> None:
         """Finish an episode's films, and then do that, in its thread."""
-        self._encoders.submit(worker, partial(self._finish, reels, then))
+        self._encoders.submit(worker, partial(self._finish, streams, then))
 
-    def _finish(self, reels: Mapping[str, Reel], then: Finished) -> None:
+    def _finish(self, streams: Mapping[str, VideoStream], then: Finished) -> None:
         found: dict[str, FilmFacts | None] | None = None
         try:
-            if not any(reel.broken for reel in reels.values()):
-                found = {name: reel.film.close() if reel.film else None for name, reel in reels.items()}
+            if not any(stream.broken for stream in streams.values()):
+                found = {name: stream.film.close() if stream.film else None for name, stream in streams.items()}
         finally:
             if found is None:
-                _discard(reels)
+                _discard(streams)
             then(found)
 
-    def discard(self, worker: int, reels: Mapping[str, Reel], then: Job) -> None:
+    def discard(self, worker: int, streams: Mapping[str, VideoStream], then: Job) -> None:
         """Drop an episode's films, and then do that, in its thread."""
 
         def drop() -> None:
-            _discard(reels)
+            _discard(streams)
             then()
 
         self._encoders.submit(worker, drop)
@@ -372,7 +376,7 @@ class FilmThreads(Filming):
         self._encoders.close()
 
 
-def _discard(reels: Mapping[str, Reel]) -> None:
-    for reel in reels.values():
-        if reel.film is not None:
-            reel.film.discard()
+def _discard(streams: Mapping[str, VideoStream]) -> None:
+    for stream in streams.values():
+        if stream.film is not None:
+            stream.film.discard()

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arena_newton.data.readers.looks import Looks
 from arena_newton.errors import InputError
 from arena_newton.files import limits
 from arena_newton.files.own_files import replace_atomically
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 __all__ = ["CAMERAS", "FIELDS", "SCHEMA_VERSION", "VIDEO_FOLDER", "EpisodeFile", "Field", "camera_fields"]
-__all__ += ["episode_files", "fields_table", "opened", "vision", "write_episode"]
+__all__ += ["episode_files", "fields_table", "looks_film", "opened", "vision", "write_episode"]
 
 SCHEMA_VERSION = "arena_episode_v1"
 """Version of the fields."""
@@ -42,7 +43,7 @@ CAMERAS = {"front": "", "left_wrist": "left_wrist_", "right_wrist": "right_wrist
 """Camera as datasets name it → its part of a field's name; the head camera's have none, as in the original."""
 PICTURES = ("storage_format", "frame_indices", "rgb_video_path", "rgb_video_fps", "rgb_video_num_frames", "depth")
 """Fields of a camera, as the original names them after `vision_<camera>`."""
-OWN_PICTURES = ("size", "codec", "histogram")
+OWN_PICTURES = ("size", "codec", "histogram", "looks")
 """Our own fields of a camera, after `arena_vision_<camera>`."""
 MAX_ROWS = 10_000
 """Rows of an episode: the original's cap."""
@@ -110,6 +111,12 @@ FIELDS = (
     Field("arena_vision_<camera>size", "2", "int64", "width and height [px]"),
     Field("arena_vision_<camera>codec", "", "text", "JSON: codec and its options, as used"),
     Field("arena_vision_<camera>histogram", "3, 256", "int64", "pixels of all frames by channel and value, unencoded"),
+    Field(
+        "arena_vision_<camera>looks",
+        "",
+        "text",
+        "JSON: stride, second lights and shapes of the film of looks; else absent",
+    ),
     Field("arena_state", "T, 64", "float32", "canonical state as a policy sees it"),
     Field("arena_action", "T, 40", "float32", "canonical action v3.1 that was decided: the label"),
     Field("arena_executed_action", "T, 40", "float32", "what was executed: the label and the disturbance"),
@@ -151,6 +158,11 @@ def fields_table() -> str:
 def vision(camera: str, name: str) -> str:
     """Name of a camera's field: `front`, `rgb_video_path` → `vision_rgb_video_path`."""
     return f"vision_{CAMERAS[camera]}{name}"
+
+
+def looks_film(video: Path) -> Path:
+    """Film of the looks of a camera's MP4."""
+    return video.with_name(f"{video.stem.removesuffix('_rgb')}_looks.mp4")
 
 
 def camera_fields(camera: str) -> frozenset[str]:
@@ -328,6 +340,20 @@ class EpisodeFile:
         if not video.is_file() or video.is_symlink():
             raise InputError(f"{self.path}: {name}: {video} is missing")
         return video
+
+    def looks(self, camera: str) -> tuple[Looks, Path] | None:
+        """Looks of a camera's pictures and their film; None where none were recorded.
+
+        Raises:
+            InputError: The field is damaged, or the film is absent.
+        """
+        name = f"arena_{vision(camera, 'looks')}"
+        if name not in self.names:
+            return None
+        film = looks_film(self.video(camera))
+        if not film.is_file() or film.is_symlink():
+            raise InputError(f"{self.path}: {name}: {film} is missing")
+        return Looks.read(self.json(name), f"{self.path}: {name}"), film
 
     @property
     def phases(self) -> list[str]:

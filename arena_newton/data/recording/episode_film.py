@@ -50,15 +50,17 @@ class FilmFacts:
 class Film:
     """Pictures of one camera of an episode, in their order; nothing is opened before the first one."""
 
-    def __init__(self, video: Path, depth: Path, fps: float):
+    def __init__(self, video: Path, depth: Path, fps: float, lossless: bool = False):
         """Name the files.
 
         Args:
             video: The MP4, which has its name when it is complete.
             depth: Raw float16 of all depths, there until it is removed.
             fps: Frame rate [1/s].
+            lossless: Keep every byte of the pictures.
         """
         self.video, self.depth, self.fps = video, depth, fps
+        self._how: dict[str, bool] = {"b_frames": False, "sync": True, "lossless": lossless}
         self._writer: VideoWriter | None = None
         self._histogram = np.zeros((3, VALUES), np.int64)
         self._depth_file: BinaryIO | None = None
@@ -73,7 +75,7 @@ class Film:
         if self._writer is None:
             height, width = picture.shape[:2]
             gop = key_frames(height)
-            self._writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, b_frames=False, sync=True)
+            self._writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, **self._how)
         self._writer.write(picture)
         add_picture(self._histogram, picture)
         if depth is not None:

@@ -9,11 +9,12 @@ from pathlib import Path
 import av
 import numpy as np
 
+from arena_newton.data.readers.looks import Looks
 from arena_newton.data.recording.episode import EpisodeFile, vision
 from arena_newton.data.recording.image_statistics import VALUES
 from arena_newton.errors import InputError
 
-__all__ = ["SourceVideo", "source_video"]
+__all__ = ["SourceVideo", "check_film", "source_looks", "source_video"]
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,32 @@ def source_video(episode: EpisodeFile, camera: str) -> SourceVideo:
         raise InputError(f"{episode.path}: {vision(camera, 'frame_indices')} is not 0 to {episode.rows - 1}")
     if (np.asarray(histogram) < 0).any() or set(histogram.sum(axis=1)) != {episode.rows * found.width * found.height}:
         raise InputError(f"{episode.path}: arena_{vision(camera, 'histogram')} does not count {episode.rows} pictures")
-    _check(found, episode.rows)
+    check_film(found, episode.rows, f"the episode has {episode.rows} rows")
     return found
 
 
-def _check(video: SourceVideo, rows: int) -> None:
-    """Count its frames, which are packets of the file."""
+def source_looks(episode: EpisodeFile) -> tuple[Looks, Path] | None:
+    """Looks of the head camera's pictures and their film; None where none were recorded.
+
+    Raises:
+        InputError: The film is missing, or is not what the fields say.
+    """
+    found = episode.looks("front") if "front" in episode.cameras else None
+    if found is not None:
+        looks, path = found
+        width, height = episode.array(f"arena_{vision('front', 'size')}", 2).tolist()
+        fps = float(episode.array(vision("front", "rgb_video_fps"))) / looks.stride
+        film = SourceVideo(path, width, height, fps, {"vcodec": "h264"}, np.zeros(0, np.int64))
+        check_film(film, looks.frames(episode.rows), f"its episode's looks are {looks.frames(episode.rows)}")
+    return found
+
+
+def check_film(video: SourceVideo, frames_wanted: int, why: str) -> None:
+    """Count the frames of a film, which are packets of the file, and compare size, rate and codec.
+
+    Raises:
+        InputError: It is not a readable video, or another one.
+    """
     try:
         with av.open(str(video.path)) as container:
             stream = container.streams.video[0]
@@ -70,8 +91,8 @@ def _check(video: SourceVideo, rows: int) -> None:
             frames = sum(packet.size > 0 for packet in container.demux(stream))
     except (av.error.FFmpegError, OSError, IndexError, ValueError) as error:
         raise InputError(f"{video.path}: not a readable video ({type(error).__name__})") from error
-    if frames != rows:
-        raise InputError(f"{video.path}: has {frames} frames, the episode has {rows} rows")
+    if frames != frames_wanted:
+        raise InputError(f"{video.path}: has {frames} frames, {why}")
     even = video.width + video.width % 2, video.height + video.height % 2
     if about[:2] != even or about[2] != video.codec.get("vcodec"):
         raise InputError(

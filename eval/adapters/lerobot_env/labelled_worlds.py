@@ -19,6 +19,7 @@ from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE, write_actions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.policies.label_reader import measured_yaw
+from arena_newton.policies.lerobot.checkpoint_facts import vector_of
 
 if TYPE_CHECKING:
     from typing import Any
@@ -59,10 +60,11 @@ class PolicyVectorEnv(ArenaVectorEnv):
         if known and task not in known:
             raise InputError(f"--env.task {task}: the policy was trained on {', '.join(known)}")
         super().__init__(task, num_envs, **cast("dict[str, Any]", options))
-        vector = np.array([float(name == task) for name in known], np.float32)
+        trackers = self._policy.tracker_vector if known else ()
+        vector = np.array(vector_of(known, trackers, task, self.env.tracker.name), np.float32)
         self._vectors = {name: np.tile(vector, (num_envs, 1)) for name in VECTOR_KEYS} if known else {}
         if self._vectors:
-            box = spaces.Box(0.0, 1.0, (len(known),), np.float32)
+            box = spaces.Box(0.0, 1.0, vector.shape, np.float32)
             parts = cast("spaces.Dict", self.single_observation_space).spaces
             self.single_observation_space = spaces.Dict(parts | dict.fromkeys(VECTOR_KEYS, box))
             self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -152,8 +154,8 @@ class V4VectorEnv(PolicyVectorEnv):
         policy = policy or PolicyWorlds(labels="v4")
         if not 0.0 <= policy.realign <= 1.0:
             raise InputError(f"realign {policy.realign}: expected 0 to 1")
-        if policy.look_ticks < 1:
-            raise InputError(f"look_ticks {policy.look_ticks}: expected at least 1")
+        if policy.query_ticks < 1:
+            raise InputError(f"query_ticks {policy.query_ticks}: expected at least 1")
         super().__init__(task, num_envs, policy=policy, episodes=episodes, **options)
         self._decoder = V4Decoder(num_envs, realign=policy.realign)
 
@@ -161,7 +163,7 @@ class V4VectorEnv(PolicyVectorEnv):
         """Decode a tick's actions and advance; see `ArenaVectorEnv.step`."""
         acting = self._acting()
         self._decoder.measure(
-            measured_yaw(torch.from_numpy(self._state)), acting & (self.env.tick % self._policy.look_ticks == 0)
+            measured_yaw(torch.from_numpy(self._state)), acting & (self.env.tick % self._policy.query_ticks == 0)
         )
         decoded = self._decoder.decode(self._checked(actions).cpu()[:, None], acting)[:, 0]
         return super().step(decoded)

@@ -88,10 +88,12 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """Protocol of the policy's actions: v3.1, or v4, which is decoded per world; the policy's, or v3.1."""
     realign: float | None = None
     """Of v4: fraction of the gap between commanded and measured heading that is closed each tick; the policy's."""
-    look_ticks: int | None = None
-    """Of v4: ticks between two looks of the policy, at which `realign` measures the heading: its n_action_steps."""
+    query_ticks: int | None = None
+    """Of v4: ticks between two queries of the policy, at which `realign` measures the heading: its n_action_steps."""
     task_vector: str | None = None
     """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
+    tracker_vector: str | None = None
+    """Trackers in the order of the numbers that follow in it, after which one is that of any other; the policy's."""
     episodes: str | None = None
     """Folder that gets what LeRobot's files leave out: a line per episode, and its actions for `replay:`."""
 
@@ -108,17 +110,18 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(
                 f"--env.max_parallel_tasks {self.max_parallel_tasks}: tasks run one after the other, use 1"
             )
-        said = policy_worlds()
-        if said.source is not None:
-            logger.info("%s says %s; flags that are given count more", said.source, said.sentence)
+        declared = policy_worlds()
+        if declared.source is not None:
+            logger.info("%s says %s; flags that are given count more", declared.source, declared.sentence)
         worlds = self.policy_worlds = PolicyWorlds(
-            labels=said.labels if self.labels is None else self.labels,
-            realign=said.realign if self.realign is None else self.realign,
-            look_ticks=said.look_ticks if self.look_ticks is None else self.look_ticks,
-            task_vector=said.task_vector if self.task_vector is None else _names(self.task_vector),
-            width=said.width if self.image_width is None else self.image_width,
-            height=said.height if self.image_height is None else self.image_height,
-            fit=said.fit if self.fit is None else self.fit,
+            labels=declared.labels if self.labels is None else self.labels,
+            realign=declared.realign if self.realign is None else self.realign,
+            query_ticks=declared.query_ticks if self.query_ticks is None else self.query_ticks,
+            task_vector=declared.task_vector if self.task_vector is None else _names(self.task_vector),
+            tracker_vector=declared.tracker_vector if self.tracker_vector is None else _names(self.tracker_vector),
+            width=declared.width if self.image_width is None else self.image_width,
+            height=declared.height if self.image_height is None else self.image_height,
+            fit=declared.fit if self.fit is None else self.fit,
         )
         if worlds.labels not in LABELS:
             raise InputError(f"--env.labels {worlds.labels}: unknown, choose from {', '.join(LABELS)}")
@@ -126,8 +129,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError(f"--env.fit {worlds.fit}: unknown, choose from {', '.join(FITS)}")
         if not 0.0 <= worlds.realign <= 1.0:
             raise InputError(f"--env.realign {worlds.realign}: expected 0 to 1")
-        if worlds.look_ticks < 1:
-            raise InputError(f"--env.look_ticks {worlds.look_ticks}: expected at least 1")
+        if worlds.query_ticks < 1:
+            raise InputError(f"--env.query_ticks {worlds.query_ticks}: expected at least 1")
         for task in self.tasks:
             task_registry.get(task)
             if worlds.task_vector and task not in worlds.task_vector:
@@ -139,7 +142,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
         }
         if worlds.task_vector:
-            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(worlds.task_vector),))
+            told = len(worlds.task_vector) + (len(worlds.tracker_vector) + 1 if worlds.tracker_vector else 0)
+            self.features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (told,))
         self.features_map = {key: key for key in self.features}
 
     @property
@@ -180,7 +184,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             "cameras": self.prims,
             "state_keys": ("agent_pos", OBS_STATE),
             "instruction": False,
-            "settle": "reset",
+            "startup": "reset",
             "autoreset_mode": "disabled",
             "max_episode_steps": self.episode_length,
         }

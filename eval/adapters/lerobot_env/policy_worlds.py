@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,8 @@ from lerobot.configs import parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from arena_newton.errors import InputError
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
+from arena_newton.files.stored_json import read_object
 from arena_newton.pictures.settings import Fit, robot_fit
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
@@ -24,10 +25,12 @@ class PolicyWorlds:
     """Label protocol of its actions, v3.1 or v4."""
     realign: float = 0.0
     """Of v4: fraction of the gap between commanded and measured heading that is closed each tick."""
-    look_ticks: int = 20
-    """Of v4: ticks between two looks of the policy, at which the heading is measured."""
+    query_ticks: int = 20
+    """Of v4: ticks between two queries of the policy, at which the heading is measured."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given; none: it is given no such vector."""
+    tracker_vector: tuple[str, ...] = ()
+    """Trackers in the order of the numbers that follow, as of `CheckpointFacts`."""
     width: int = 224
     """Width of its pictures [px]."""
     height: int = 224
@@ -42,9 +45,10 @@ class PolicyWorlds:
         """The values, as flags of the environment."""
         flags = {"labels": self.labels, "image_width": self.width, "image_height": self.height, "fit": self.fit}
         if self.labels == "v4":
-            flags |= {"realign": self.realign, "look_ticks": self.look_ticks}
-        if self.task_vector:
-            flags["task_vector"] = ",".join(self.task_vector)
+            flags |= {"realign": self.realign, "query_ticks": self.query_ticks}
+        for name in ("task_vector", "tracker_vector"):
+            if getattr(self, name):
+                flags[name] = ",".join(getattr(self, name))
         return " ".join(f"--env.{name}={value}" for name, value in flags.items())
 
 
@@ -65,33 +69,24 @@ def policy_worlds() -> PolicyWorlds:
     if not (Path(given) / CONFIG_FILE).is_file():
         return PolicyWorlds()
     path = Path(given) / CONFIG_FILE
-    content = _config(path)
-    facts, ticks = CheckpointFacts.read(path.parent), _look_ticks(path, content)
+    content = read_object(path, MAX_CONFIG_BYTES)
+    facts, ticks = CheckpointFacts.read(path.parent), _query_ticks(path, content)
     if facts is None:
         width, height = _picture(path, content)
         fit = robot_fit(width, height)  # as eval record takes them
-        return PolicyWorlds(look_ticks=ticks, width=width, height=height, fit=fit, source=path)
+        return PolicyWorlds(query_ticks=ticks, width=width, height=height, fit=fit, source=path)
     camera = facts.camera
     return PolicyWorlds(
         labels=facts.labels,
         realign=facts.realign,
-        look_ticks=ticks,
+        query_ticks=ticks,
         task_vector=facts.task_vector,
+        tracker_vector=facts.tracker_vector,
         width=camera.width,
         height=camera.height,
         fit=camera.fit,
         source=path.with_name(FACTS_FILE),
     )
-
-
-def _config(path: Path) -> Mapping[str, object]:
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds {type(content).__name__}, expected an object")
-    return content
 
 
 def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:
@@ -106,8 +101,8 @@ def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:
     return shape[2], shape[1]
 
 
-def _look_ticks(path: Path, content: Mapping[str, object]) -> int:
-    """Ticks between two looks, by LeRobot's flags of the policy where they change them."""
+def _query_ticks(path: Path, content: Mapping[str, object]) -> int:
+    """Ticks between two queries, by LeRobot's flags of the policy where they change them."""
     values: dict[str, object] = {}
     for name in ("n_action_steps", "temporal_ensemble_coeff"):
         flag = parser.parse_arg(f"policy.{name}")

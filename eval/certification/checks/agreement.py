@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -20,9 +21,9 @@ from arena_newton.eval.certification.finding import (
     score,
     skipped,
 )
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.eval.statistics.stats import mcnemar
-from arena_newton.eval.workers.slice_player import device_name
+from arena_newton.eval.workers.batch_player import device_name
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table, percent
 from arena_newton.physics.devices import resolve_engine
 
@@ -76,12 +77,8 @@ def _same_start(context: Context, other: str, device: str) -> tuple[str, Table, 
     rows, wrong, most = [], [], 0.0
     tracker = context.trackers[0]
     for task in context.tasks:
-
-        def measure(task: str = task) -> JsonObject:
-            return first_ticks(context, task, tracker, other, device)
-
+        measure = functools.partial(first_ticks, context, task, tracker, other, device)
         found = context.measured("engines", task, tracker, {"other": other, "device": device}, measure)
-        assert isinstance(found, dict)
         unlike, gaps = [str(name) for name in found["unlike"]], [float(gap) for gap in found["gaps"]]
         most = max(most, *gaps)
         rows.append((task, " ".join(unlike) or "none", *(f"{gap:.1e}" for gap in gaps)))
@@ -173,13 +170,13 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Tab
         "falls",
         "p of falls",
     )
-    said = [
+    gaps = [
         f"{what} by {percent(low)} % to {percent(high)} %"
         for what, (low, high) in zip(("success", "falls"), bounds.values(), strict=True)
     ]
     notes = [
         f"Engines are equivalent where the 95 % interval of the difference of their rates, all {pairs} pairs of the "
-        f"same episodes together, is within {percent(MARGIN, 0)} % on either side: {'; '.join(said)}. It has the upper "
+        f"same episodes together, is within {percent(MARGIN, 0)} % on either side: {'; '.join(gaps)}. It has the upper "
         "97.5 % bounds (Clopper and Pearson) of the pairs that only one engine wins, less 0 of the other's: wider than "
         "the interval of `eval compare`, and sure to cover in 95 %. "
         f"They differ in a cell where p, that of McNemar's exact test, is below {level:.2g}: {DIFFERENT} over "
@@ -190,7 +187,7 @@ def _rates(context: Context, other: str, device: str) -> tuple[Verdict, str, Tab
     verdict: Verdict = "fail" if apart or far else "pass" if within else "note"
     if verdict == "note":
         notes.append(f"{pairs} pairs are too few to show that the rates are within {percent(MARGIN, 0)} %.")
-    summary = f"{this} and {other} on {where}: rates differ in {', '.join(said)} (95 %)"
+    summary = f"{this} and {other} on {where}: rates differ in {', '.join(gaps)} (95 %)"
     return verdict, summary, Table(head, rows, title="Rates of both engines"), tuple(notes)
 
 
@@ -202,12 +199,8 @@ def batches(context: Context) -> CheckFinding:
     ticks, rows, broken = BATCHED_TICKS[not quick], [], []
     for tracker in context.trackers:
         for task in context.tasks[:BATCHED_TASKS] if quick else context.tasks:
-
-            def measure(task: str = task, tracker: str = tracker) -> JsonObject:
-                return _compare_batches(context, task, tracker, ticks)
-
+            measure = functools.partial(_compare_batches, context, task, tracker, ticks)
             found = context.measured("batches", task, tracker, {"ticks": ticks}, measure)
-            assert isinstance(found, dict)
             differs = found["differs"]
             rows.append((task, tracker, f"{int(found['ticks']):,}", "none" if differs is None else str(differs)))
             broken += [f"{task} through {tracker}: differs from tick {differs} on"] * (differs is not None)

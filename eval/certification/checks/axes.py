@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +16,7 @@ from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.checks.traces import first_difference, play, world_of
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Score, score, skipped
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
@@ -45,13 +46,9 @@ def visual(context: Context) -> CheckFinding:
     tracker, rows, broken, pictures = context.trackers[0], [], [], []
     for task in context.tasks:
         seeds, picture = context.seeds(task, number), context.folder / "pictures" / f"visual_{task}.png"
-
-        def measure(task: str = task, seeds: list[int] = seeds, picture: Path = picture) -> JsonObject:
-            return _compare_modes(context, task, tracker, seeds, ticks, picture)
-
+        measure = functools.partial(_compare_modes, context, task, tracker, seeds, ticks, picture)
         settings: JsonObject = {"seeds": list(seeds), "ticks": ticks}
         found = context.measured("visual", task, tracker, settings, measure)
-        assert isinstance(found, dict)
         compared, differs, changed = int(found["ticks"]), found["differs"], float(found["changed"])
         rows.append(
             (task, str(len(seeds)), f"{compared:,}", "none" if differs is None else str(differs), f"{changed:.1f}")

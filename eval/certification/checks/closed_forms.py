@@ -26,7 +26,7 @@ from arena_newton.usd_scenes.g1.links import LINKS
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json
+    from arena_newton.files.stored_json import Json
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "TOLERANCE", "Bench", "Measurement", "measured_in"]
@@ -96,7 +96,7 @@ class Measurement(NamedTuple):
         """The same as JSON can say it: a world that diverged measures a number beyond all bounds."""
         return self if math.isfinite(self.measured) else self._replace(measured=DIVERGED)
 
-    def said(self) -> str:
+    def text(self) -> str:
         """The number in words."""
         return f"{self.what} is {self.measured:.4g}, expected {self.expected:.4g}"
 
@@ -435,7 +435,7 @@ def physics(context: Context) -> CheckFinding:
         found = context.measured(f"physics_{engine}", task, tracker, {"device": device, "whole": whole}, measure)
         numbers = [Measurement(*one) for one in cast("list[list]", found)]
         where = f"{task} through {tracker} on {engine}"
-        wrong += [f"{where}: {one.said()}" for one in numbers if not one.holds]
+        wrong += [f"{where}: {one.text()}" for one in numbers if not one.holds]
         count += len(numbers)
         for kind, ones in _by_kind(numbers).items():
             most = max(ones, key=lambda one: abs(one.deviation))

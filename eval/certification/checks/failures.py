@@ -48,13 +48,13 @@ class Confusion:
     """Scripted failures by the stage that was scripted and the stage that was said."""
 
     counts: Mapping[tuple[FailureStage, FailureStage], int]
-    """(scripted, said) → episodes."""
+    """(scripted, found) → episodes."""
 
     def scripted(self, stage: FailureStage) -> int:
         """Number of scripted failures of a stage."""
-        return sum(self.counts.get((stage, said), 0) for said in FailureStage)
+        return sum(self.counts.get((stage, text), 0) for text in FailureStage)
 
-    def said(self, stage: FailureStage) -> int:
+    def found(self, stage: FailureStage) -> int:
         """Number of failures that the rules assign to a stage."""
         return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
 
@@ -63,16 +63,16 @@ class Confusion:
         return self._part(stage, self.scripted(stage))
 
     def precision(self, stage: FailureStage) -> float | None:
-        """Part of those said to be of a stage that were scripted so; None where none is."""
-        return self._part(stage, self.said(stage))
+        """Part of those found at a stage that were scripted so; None where none is."""
+        return self._part(stage, self.found(stage))
 
     def _part(self, stage: FailureStage, total: int) -> float | None:
         return self.counts.get((stage, stage), 0) / total if total else None
 
 
 def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Confusion:
-    """Counts of pairs (scripted, said); pairs without a failure are left out."""
-    return Confusion(Counter((scripted, said) for scripted, said in pairs if said is not None))
+    """Counts of pairs (scripted, found); pairs without a failure are left out."""
+    return Confusion(Counter((scripted, text) for scripted, text in pairs if text is not None))
 
 
 def failures(context: Context) -> CheckFinding:
@@ -141,7 +141,7 @@ def _below(matrix: Confusion) -> list[tuple[str, bool]]:
         if not matrix.scripted(stage):
             continue
         right = matrix.counts.get((stage, stage), 0)
-        for name, total in (("recall", matrix.scripted(stage)), ("precision", matrix.said(stage))):
+        for name, total in (("recall", matrix.scripted(stage)), ("precision", matrix.found(stage))):
             if total and right < LEAST * total:
                 text = f"{name} of {stage} is {right} of {total}, expected at least {LEAST:g}"
                 shown = total >= ENOUGH or wilson(right, total)[1] < LEAST
@@ -158,7 +158,7 @@ def _sheet(task: str, matrix: Confusion) -> Table:
     rows = [
         (
             str(scripted),
-            *(str(matrix.counts.get((scripted, said), 0)) for said in FailureStage),
+            *(str(matrix.counts.get((scripted, text), 0)) for text in FailureStage),
             part(matrix.recall(scripted)),
             part(matrix.precision(scripted)),
         )

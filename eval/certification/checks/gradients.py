@@ -6,6 +6,7 @@ What has no exact gradient, a step of the engines, is not compared (`docs/gradie
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -28,7 +29,7 @@ from arena_newton.tasks.judge import Judge
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json, JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight_slopes"]
@@ -110,12 +111,9 @@ def gradients(context: Context) -> CheckFinding:
     rows, wrong, worst = [], [], 0.0
     for tracker in context.sample:
         for task in context.tasks:
-
-            def measure(task: str = task, tracker: str = tracker) -> Json:
-                return _measured(context, task, tracker)
-
+            measure = functools.partial(_measured, context, task, tracker)
             ticks = TICKS[not context.options.quick]
-            found = cast("JsonObject", context.measured("gradients", task, tracker, {"ticks": ticks}, measure))
+            found = context.measured("gradients", task, tracker, {"ticks": ticks}, measure)
             for what, numbers in found.items():
                 one = Agreement(*cast("Sequence[float]", numbers))  # type: ignore[arg-type]  # counts come first
                 counts = (str(one.compared), str(one.total - one.compared))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import check_parts
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
 from arena_newton.interfaces import Chunk, Observation, Tracker
 from arena_newton.pages.tables import Table
@@ -62,11 +63,8 @@ def policy_inputs(context: Context) -> CheckFinding:
     rows, wrong = [], []
     tracker = context.trackers[0]
     for task in context.tasks[:1] if context.options.quick else context.tasks:
-
-        def measure(task: str = task) -> JsonObject:
-            return _sought(context, task, tracker)
-
-        found = cast(JsonObject, context.measured("policy-inputs", task, tracker, {"seeds": SEEDS_TRIED}, measure))
+        measure = functools.partial(_sought, context, task, tracker)
+        found = context.measured("policy-inputs", task, tracker, {"seeds": SEEDS_TRIED}, measure)
         rows.append((task, str(found["given"]), f"{found['known']}/{found['episodes']}"))
         wrong += [
             f"{task}: placements of {found['known']} of {found['episodes']} episodes follow from the seed"
@@ -164,11 +162,8 @@ def tracker_inputs(context: Context) -> CheckFinding:
     for tracker, task in itertools.product(
         context.trackers, context.tasks[:1] if context.options.quick else context.tasks
     ):
-
-        def measure(task: str = task, tracker: str = tracker) -> JsonObject:
-            return _listen(context, task, tracker)
-
-        found = cast(JsonObject, context.measured("tracker-inputs", task, tracker, {"ticks": HEARD_TICKS}, measure))
+        measure = functools.partial(_listen, context, task, tracker)
+        found = context.measured("tracker-inputs", task, tracker, {"ticks": HEARD_TICKS}, measure)
         rows.append((task, tracker, str(found["ticks"]), "none" if found["differs"] is None else str(found["differs"])))
         if found["differs"] is not None:
             wrong.append(

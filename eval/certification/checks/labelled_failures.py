@@ -27,7 +27,7 @@ class LabelledFailure:
 
     number: int
     """Even: thresholds were set with it; odd: they were not."""
-    said: tuple[FailureStage, ...]
+    stages: tuple[FailureStage, ...]
     """By the rules, then by each reader."""
 
 
@@ -65,10 +65,10 @@ def labelled_failures(folder: Path = LABELLED) -> list[LabelledFailure]:
         rows = {int(row["number"]): row for row in csv.DictReader(file)}
     if sorted(rows) != [record.index for record in records]:
         raise InputError(f"{path}: its numbers are not those of episodes.jsonl")
-    return [LabelledFailure(record.index, _said(path, record, rows[record.index])) for record in records]
+    return [LabelledFailure(record.index, _judgements(path, record, rows[record.index])) for record in records]
 
 
-def _said(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple[FailureStage, ...]:
+def _judgements(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple[FailureStage, ...]:
     ruled = stage_of(record)
     try:
         read = [FailureStage(row[judge]) for judge in JUDGES[1:] if judge in row]
@@ -82,10 +82,10 @@ def _said(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple[Failu
 def agreements(failures: Sequence[LabelledFailure]) -> list[JudgeAgreement]:
     """Of the rules with each reader and of the readers, for even and odd numbers and for all."""
     found = []
-    for a, b in itertools.combinations(range(len(failures[0].said)), 2):
+    for a, b in itertools.combinations(range(len(failures[0].stages)), 2):
         for part, remainders in PARTS.items():
             some = [one for one in failures if one.number % 2 in remainders]
-            same = sum(one.said[a] == one.said[b] for one in some)
+            same = sum(one.stages[a] == one.stages[b] for one in some)
             found.append(JudgeAgreement((JUDGES[a], JUDGES[b]), part, same, len(some)))
     return found
 
@@ -96,9 +96,9 @@ def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Table]:
         (*one.judges, one.part, str(one.failures), str(one.same), f"{one.rate:.2f}") for one in agreements(failures)
     ]
     sheets = [Table(("judge", "and", "numbers", "failures", "same", "rate"), rows, title="real failures: agreement")]
-    for a, b in itertools.combinations(range(len(failures[0].said)), 2):
-        counts = Counter((one.said[b], one.said[a]) for one in failures)
-        table = tuple((str(row), *(str(counts[row, said]) for said in FailureStage)) for row in FailureStage)
+    for a, b in itertools.combinations(range(len(failures[0].stages)), 2):
+        counts = Counter((one.stages[b], one.stages[a]) for one in failures)
+        table = tuple((str(row), *(str(counts[row, text]) for text in FailureStage)) for row in FailureStage)
         head = (JUDGES[b], *(f"said {stage}" for stage in FailureStage))
         sheets.append(Table(head, table, title=f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)"))
     return sheets

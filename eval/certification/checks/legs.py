@@ -69,14 +69,14 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Table, t
 
 def _broken(context: Context, body: str) -> tuple[str, ...]:
     """Why zero successes would say nothing: episodes ended as errors, or nobody solves the task with legs either."""
-    said = []
+    lines = []
     for tracker, task in itertools.product(context.sample, context.tasks):
         records = context.evaluate(_cell(context, task, tracker, body))
         errors = sum(record.outcome == "error" for record in records)
-        said += [f"{task} through {tracker}: {errors} episodes ended as errors"] * bool(errors)
+        lines += [f"{task} through {tracker}: {errors} episodes ended as errors"] * bool(errors)
         if not score(context.evaluate(recorded(context, task, tracker))).successes:
-            said.append(f"{task} through {tracker}: the expert does not solve it with legs either")
-    return tuple(said)
+            lines.append(f"{task} through {tracker}: the expert does not solve it with legs either")
+    return tuple(lines)
 
 
 def frozen(context: Context) -> CheckFinding:

@@ -17,7 +17,7 @@ from arena_newton.pictures.settings import CameraConfig
 
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
-    from arena_newton.eval.records.schema import Json
+    from arena_newton.files.stored_json import Json
 
 __all__ = ["CHECKS", "lens_of"]
 
@@ -69,7 +69,7 @@ def _tangents() -> tuple[float, float]:
 
 
 def lens_of(env: ArenaEnv) -> tuple[float, float, int]:
-    """Half width and half height of the head camera's picture at unit distance, and how many pixels told them.
+    """Half width and half height of the head camera's picture at unit distance, and how many pixels they come from.
 
     A pixel's place in the picture and its distance give a point; those of the floor are at height 0 with the true lens.
     """

@@ -22,10 +22,10 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
-from arena_newton.eval.records.schema import Json, JsonObject
 from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
 from arena_newton.files.own_processes import environment
+from arena_newton.files.stored_json import Json, JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
 
@@ -70,8 +70,8 @@ class RayRun:
     """Episodes that had ended when a process was killed; None where none was."""
     lost: int
     """Processes that the run says it replaced."""
-    said: str
-    """The last line of what it said."""
+    last_line: str
+    """Last line that it printed."""
 
 
 def plan_of(context: Context) -> RunOptions:
@@ -111,11 +111,10 @@ def shards(context: Context) -> CheckFinding:
             return compared(alone, Path(kept) / "merged")
 
     found = context.measured("shards", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if "refused" in found:
         return CheckFinding("fail", f"shards are not merged: {found['refused']}")
-    verdict, said, wrong = _judged(found, f"{SHARDS} merged shards")
-    return CheckFinding(verdict, said, (_sheet(plan, found, f"{SHARDS} merged shards"),), wrong)
+    verdict, text, wrong = _judged(found, f"{SHARDS} merged shards")
+    return CheckFinding(verdict, text, (_sheet(plan, found, f"{SHARDS} merged shards"),), wrong)
 
 
 def ray(context: Context) -> CheckFinding:
@@ -134,22 +133,26 @@ def ray(context: Context) -> CheckFinding:
         folder = alone.with_name(f"ray_{next(numbers)}")
         context.say(f"plan, by {ACTORS} Ray actors of which one is killed: {folder.name}")
         run = play_by_ray(plan, folder)
-        facts: JsonObject = {"code": run.code, "killed_after": run.killed_after, "lost": run.lost, "said": run.said}
+        facts: JsonObject = {
+            "code": run.code,
+            "killed_after": run.killed_after,
+            "lost": run.lost,
+            "said": run.last_line,
+        }
         return facts | (compared(alone, folder) if run.code in (0, 1) else {})
 
     found = context.measured("ray", plan.task, plan.tracker, {"episodes": EPISODES}, measure)
-    assert isinstance(found, dict)
     if found["code"] not in (0, 1):
         how = f"took longer than {RAY_MINUTES:g} min" if found["code"] is None else f"ended with code {found['code']}"
         return CheckFinding("fail", f"a run by a Ray cluster {how}: {found['said']}")
-    verdict, said, wrong = _judged(found, f"{ACTORS} Ray actors")
+    verdict, text, wrong = _judged(found, f"{ACTORS} Ray actors")
     killed = found["killed_after"] is not None and bool(found["lost"])
     if not killed:
         verdict = "note" if verdict == "pass" else verdict
         wrong += ("No process was lost: all episodes had ended before one could be killed.",)
     else:
-        said += f"; one actor was killed with SIGKILL after {counted(cast('int', found['killed_after']), 'episode')}"
-    return CheckFinding(verdict, said, (_sheet(plan, found, "Ray cluster"),), wrong)
+        text += f"; one actor was killed with SIGKILL after {counted(cast('int', found['killed_after']), 'episode')}"
+    return CheckFinding(verdict, text, (_sheet(plan, found, "Ray cluster"),), wrong)
 
 
 def _alone(context: Context, plan: RunOptions) -> Path:
@@ -185,8 +188,8 @@ def _judged(found: JsonObject, who: str) -> tuple[Verdict, str, tuple[str, ...]]
     wrong += (f"{len(different) - NAMED} more files differ",) * (len(different) > NAMED)
     wrong += (f"{found['errors']} of {counted(episodes, 'episode')} ended as errors.",) * bool(found["errors"])
     alike = f"{len(files) - len(different)} of {len(files)} files"
-    said = f"{alike} of {who} ({counted(episodes, 'episode')}) are those of one process, byte for byte"
-    return "fail" if wrong else "pass", said, wrong
+    text = f"{alike} of {who} ({counted(episodes, 'episode')}) are those of one process, byte for byte"
+    return "fail" if wrong else "pass", text, wrong
 
 
 def _sheet(plan: RunOptions, found: JsonObject, other: str) -> Table:
@@ -216,9 +219,9 @@ def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:
     flags += ["--ray", "--ray-cpus", "1", "--ray-actors", str(ACTORS)]
     folder.parent.mkdir(parents=True, exist_ok=True)
     log, code = folder.with_suffix(".log"), None
-    with open(log, "wb") as said:
+    with open(log, "wb") as output:
         process = subprocess.Popen(
-            [*COMMAND, *flags], env=environment(), stdout=said, stderr=said, start_new_session=True
+            [*COMMAND, *flags], env=environment(), stdout=output, stderr=output, start_new_session=True
         )
         try:
             killed_after = _kill_one(process, folder)

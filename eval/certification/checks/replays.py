@@ -6,9 +6,9 @@ act. An expert that moves things, a recorder that loses a tick and an outcome th
 
 from __future__ import annotations
 
+import functools
 import itertools
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.identity import config_hash
 from arena_newton.eval.records.journal import EpisodeRecord
-from arena_newton.eval.records.schema import JsonObject
 from arena_newton.files.own_files import file_label
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.files.untrusted_files import read_arrays
 from arena_newton.pages.tables import Table
@@ -124,11 +124,8 @@ def recording(context: Context) -> CheckFinding:
     for tracker, task in itertools.product(
         context.sample, context.tasks[:1] if context.options.quick else context.tasks
     ):
-
-        def measure(task: str = task, tracker: str = tracker) -> JsonObject:
-            return _record_twice(context, task, tracker)
-
-        found = cast(JsonObject, context.measured("recording", task, tracker, {"ticks": RECORDED_TICKS}, measure))
+        measure = functools.partial(_record_twice, context, task, tracker)
+        found = context.measured("recording", task, tracker, {"ticks": RECORDED_TICKS}, measure)
         rows.append((task, tracker, *(str(found[key]) for key in ("steps", "rows", "actions", "arrays"))))
         wrong += [f"{task} through {tracker}: {found['wrong']}"] * bool(found["wrong"])
     head = ("task", "tracker", "steps", "recorded rows", "recorded actions", "arrays compared with a replay's")

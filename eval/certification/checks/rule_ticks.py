@@ -23,7 +23,7 @@ from arena_newton.rollout import Rollout
 from arena_newton.tasks import boxing, double_desk, football, open_door, pp_box, vis_navi
 
 if TYPE_CHECKING:
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
     from arena_newton.tasks.handles import BodyFrame, Marker
 
@@ -183,13 +183,13 @@ def rules(context: Context) -> CheckFinding:
             env.close()
             return {"found": [list(pair) for pair in ticks.found]}
 
-        found = cast("JsonObject", context.measured("rules", task, tracker, {"seeds": list(seeds)}, measure))["found"]
+        found = context.measured("rules", task, tracker, {"seeds": list(seeds)}, measure)["found"]
         for held, judged in found:
-            told = [("none" if tick is None else str(tick)) for tick in (held, judged)]
-            rows.append((task, str(RULES[task][1]), *told))
+            shown = [("none" if tick is None else str(tick)) for tick in (held, judged)]
+            rows.append((task, str(RULES[task][1]), *shown))
             compared += held is not None
             if held != judged:
-                wrong.append(f"{task}: succeeds at tick {told[1]}, its rule holds from tick {told[0]} on")
+                wrong.append(f"{task}: succeeds at tick {shown[1]}, its rule holds from tick {shown[0]} on")
     if not compared:
         wrong.append("no episode succeeded")
     head = ("task", "ticks in a row", "the rule holds at tick", "the episode succeeds at tick")

@@ -18,7 +18,7 @@ from arena_newton.tasks.double_desk import SILL
 
 if TYPE_CHECKING:
     from arena_newton.eval.certification.context import Context
-    from arena_newton.eval.records.schema import JsonObject
+    from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
 
 __all__ = ["CHECKS", "Treads"]
@@ -60,7 +60,7 @@ def sill(context: Context) -> CheckFinding:
     """Count the touches of the expert's episodes through each tracker."""
     if TASK not in context.tasks:
         return skipped(f"needs --task {TASK}")
-    rows, said = [], []
+    rows, parts = [], []
     for tracker in context.trackers:
         measure = functools.partial(_count, context, tracker)
         found = context.measured("sill", TASK, tracker, {"episodes": context.episodes}, measure)
@@ -69,7 +69,7 @@ def sill(context: Context) -> CheckFinding:
         touched = ticks[ticks > 0]
         middle = f"{np.median(touched):g}, {touched.max()}" if len(touched) else "-"
         rows.append((tracker, f"{free}/{len(ticks)}", f"{trod}/{len(ticks)}", middle, f"{force.max():.0f}"))
-        said.append(f"{tracker} crosses without a touch in {percent(free / len(ticks), 0)} %")
+        parts.append(f"{tracker} crosses without a touch in {percent(free / len(ticks), 0)} %")
     head = (
         "tracker",
         "without a touch",
@@ -78,7 +78,7 @@ def sill(context: Context) -> CheckFinding:
         "most force [N]",
     )
     sheet = Table(head, rows, title="Touches of the sill in an episode")
-    return CheckFinding("note", "; ".join(said), (sheet,), ("An episode that touches the sill counts as it ends.",))
+    return CheckFinding("note", "; ".join(parts), (sheet,), ("An episode that touches the sill counts as it ends.",))
 
 
 def _count(context: Context, tracker: str) -> JsonObject:

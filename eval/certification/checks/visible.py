@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from arena_newton import policies
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
-from arena_newton.eval.records.schema import JsonObject
+from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.kernels.tick import RUNNING
 from arena_newton.pages.tables import Table
@@ -51,12 +52,8 @@ def visible(context: Context) -> CheckFinding:
             missing.append(f"{task}: no target is named for it")
             continue
         picture = context.folder / "pictures" / f"visible_{task}.png"
-
-        def measure(task: str = task, picture: Path = picture) -> JsonObject:
-            return _look(context, task, tracker, picture)
-
+        measure = functools.partial(_look, context, task, tracker, picture)
         found = context.measured("visible", task, tracker, {"episodes": context.episodes}, measure)
-        assert isinstance(found, dict)
         sights, pixels = list(found["first"]), list(found["pixels"])
         seen = sorted(int(tick) for tick in sights if tick is not None)
         at_once = seen.count(0)

@@ -10,7 +10,15 @@ from torch import nn
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
-from arena_newton.policies.train.families.policy_model import ACTION, FRONT, PAD, TrainableModel, new_policy, prepared
+from arena_newton.policies.train.families.policy_model import (
+    ACTION,
+    FRONT,
+    Losses,
+    TrainableModel,
+    new_policy,
+    prepared,
+    valid_mean,
+)
 from arena_newton.policies.train.families.resnet_weights import check_resnet, load_resnet
 from arena_newton.policies.train.frames.feature_scaling import Stats
 
@@ -23,20 +31,19 @@ _COUNTER = "num_batches_tracked"
 class ActModel(TrainableModel):
     """ACT and its loss."""
 
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+    def losses(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> Losses:
         """L1 of the actions that are not padding, and the weighted divergence of the latent (`ACTPolicy.forward`)."""
-        actions, pad = batch[ACTION], batch[PAD]
-        assert isinstance(actions, torch.Tensor) and isinstance(pad, torch.Tensor)
+        actions = batch[ACTION]
+        assert isinstance(actions, torch.Tensor)
         config = self.policy.config
         inputs = {**batch, "observation.images": [batch[name] for name in config.image_features]}
         predicted, (mean, log_variance) = self.policy.model(inputs)
-        valid = ~pad.unsqueeze(-1)
-        count = (valid.sum() * actions.shape[-1]).clamp_min(1)
-        loss = ((actions - predicted).abs() * valid).sum() / count
+        loss, each = valid_mean((actions - predicted).abs(), batch)
         if mean is not None:
-            divergence = (-0.5 * (1 + log_variance - mean.pow(2) - log_variance.exp())).sum(-1).mean()
-            loss = loss + divergence * config.kl_weight
-        return loss
+            divergence = (-0.5 * (1 + log_variance - mean.pow(2) - log_variance.exp())).sum(-1)
+            loss = loss + divergence.mean() * config.kl_weight
+            each = each + divergence.detach() * config.kl_weight
+        return loss, each
 
     def compiled_parts(self) -> list[nn.Module]:
         """The whole network."""

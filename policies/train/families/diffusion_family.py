@@ -12,6 +12,7 @@ from torch import nn
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
+    Losses,
     TrainableModel,
     new_policy,
     prepared,
@@ -40,7 +41,7 @@ class DiffusionModel(TrainableModel):
         time = torch.randint(0, len(self._signal), (rows,), device=self.device, generator=generator)
         return {"noise": noise, "time": time}
 
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+    def losses(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> Losses:
         """Squared error of the predicted noise or actions (`DiffusionModel.compute_loss` of LeRobot)."""
         actions = batch[ACTION]
         assert isinstance(actions, torch.Tensor)

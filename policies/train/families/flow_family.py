@@ -30,6 +30,7 @@ from arena_newton.policies.lerobot.encoder_sources import (
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
+    Losses,
     TrainableModel,
     finished,
     new_policy,
@@ -88,7 +89,7 @@ class FlowModel(TrainableModel):
             uniform = config.timestep_sampling_s * (1.0 - uniform ** (1.0 / config.timestep_sampling_alpha))
         return {"noise": noise, "time": uniform}
 
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+    def losses(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> Losses:
         """Squared error of the velocity (`FlowMatchingObjective.compute_loss`)."""
         actions = batch[ACTION]
         assert isinstance(actions, torch.Tensor)
@@ -206,8 +207,8 @@ def _whole(kind: type[PreTrainedModel], folder: Path) -> torch.nn.Module:
     finally:
         transformers_logging.set_verbosity(said_before)
     assert isinstance(loaded, tuple)
-    model, said = loaded
-    missing = sorted({*said["missing_keys"], *(one[0] for one in said.get("mismatched_keys", ()))})
+    model, text = loaded
+    missing = sorted({*text["missing_keys"], *(one[0] for one in text.get("mismatched_keys", ()))})
     if missing:
         raise InputError(
             f"{folder}: weights of CLIP are incomplete, {missing[0]} and {len(missing) - 1} others are not there"

@@ -37,6 +37,7 @@ from arena_newton.policies.train.families.policy_model import (
     ACTION,
     STATE,
     WEIGHTS_FILE,
+    Losses,
     TrainableModel,
     finished,
     new_policy,
@@ -117,7 +118,7 @@ class Pi05Model(TrainableModel):
         time = uniform ** (1.0 / config.time_sampling_beta_alpha) * config.time_sampling_scale
         return {"noise": noise, "time": time + config.time_sampling_offset}
 
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+    def losses(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> Losses:
         """Squared error of the velocity of the 40 numbers (`PI05Policy.forward`)."""
         actions, state = batch[ACTION], batch[STATE]
         assert isinstance(actions, torch.Tensor) and isinstance(state, torch.Tensor)
@@ -132,8 +133,8 @@ class Pi05Model(TrainableModel):
         errors = self.policy.model.forward(
             pictures, seen, batch[TOKENS], batch[MASK], padded, drawn["noise"], drawn["time"]
         )
-        mean: torch.Tensor = errors[:, :, : actions.shape[-1]].mean()
-        return mean
+        own: torch.Tensor = errors[:, :, : actions.shape[-1]]
+        return own.mean(), own.detach().mean(dim=(1, 2))
 
     def tokens(self, tasks: Sequence[str], state: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Tokens of prompts with instruction and state; an instruction whose prompt could be cut is refused."""
@@ -207,10 +208,10 @@ def load_base(policy: PreTrainedPolicy, path: Path) -> str:
     own = policy.state_dict()
     missing, left = sorted(set(own) - set(found)), sorted(set(found) - set(own))
     if missing or left:
-        said = [
+        lines = [
             f"{len(names)} {what}, {names[0]}" for names, what in ((missing, "missing"), (left, "unknown")) if names
         ]
-        raise InputError(f"{path}: not the weights of this policy ({'; '.join(said)})")
+        raise InputError(f"{path}: not the weights of this policy ({'; '.join(lines)})")
     ready: dict[str, torch.Tensor] = {}
     for name, tensor in own.items():
         given = found[name].to(tensor.dtype)

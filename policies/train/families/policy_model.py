@@ -31,12 +31,17 @@ __all__ = [
     "TASK_VECTOR",
     "WEIGHTS_FILE",
     "TrainableModel",
+    "Losses",
     "configuration",
     "finished",
     "new_policy",
     "prepared",
+    "valid_mean",
     "with_time_axis",
 ]
+
+type Losses = tuple[torch.Tensor, torch.Tensor]
+"""Loss of a batch, a scalar, and each sample's part of it without a gradient, shape [B], whose mean it is."""
 
 FRONT = "observation.images.front"
 """Key of the head camera's picture, float32 [B, 3, H, W]."""
@@ -75,7 +80,7 @@ def configuration(recipe: TrainingRecipe, stats: Stats, device: torch.device) ->
     network = {name: tuple(value) if isinstance(value, list) else value for name, value in network.items()}
     network["normalization_mapping"] = {kind: NormalizationMode(mode) for kind, mode in modes.items()}
     inputs = {
-        FRONT: PolicyFeature(FeatureType.VISUAL, (3, recipe.picture, recipe.picture)),
+        FRONT: PolicyFeature(FeatureType.VISUAL, (3, recipe.height, recipe.picture)),
         STATE: PolicyFeature(FeatureType.STATE, tuple(stats[STATE]["mean"].shape)),
     }
     if recipe.use_task_vector:
@@ -146,14 +151,18 @@ class TrainableModel(abc.ABC):
         return self.scalings[feature].normalise(value)
 
     @abc.abstractmethod
-    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
-        """Loss of a normalised batch, a scalar on the device; the host does not wait.
+    def losses(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> Losses:
+        """Loss of a normalised batch and of its samples, on the device; the host does not wait.
 
         Args:
             batch: As the module's `families` says.
             noise: What `noise` returns; drawn here where it is not given. Dropout, and ACT's latent, draw from torch's
                 own generator, which a CUDA graph advances.
         """
+
+    def loss(self, batch: Mapping[str, object], noise: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+        """Loss of a normalised batch, a scalar; see `losses`."""
+        return self.losses(batch, noise)[0]
 
     @abc.abstractmethod
     def compiled_parts(self) -> list[nn.Module]:
@@ -179,14 +188,11 @@ class TrainableModel(abc.ABC):
         groups = [{"params": rest, "lr": self.recipe.lr}, {"params": backbone, "lr": self.recipe.lr_backbone}]
         return [group for group in groups if group["params"]]
 
-    def mean_error(self, errors: torch.Tensor, batch: Mapping[str, object]) -> torch.Tensor:
+    def mean_error(self, errors: torch.Tensor, batch: Mapping[str, object]) -> Losses:
         """Mean of errors [B, n, 40]; where LeRobot's configuration says so, of those that are not padding."""
         if not self.policy.config.do_mask_loss_for_padding:
-            return errors.mean()
-        pad = batch[PAD]
-        assert isinstance(pad, torch.Tensor)
-        valid = ~pad.unsqueeze(-1)
-        return (errors * valid).sum() / (valid.sum() * errors.shape[-1]).clamp_min(1)
+            return errors.mean(), errors.detach().mean(dim=(1, 2))
+        return valid_mean(errors, batch)
 
     def is_backbone(self, parameter: str) -> bool:
         """True if a parameter, by name, belongs to the vision encoder and has the recipe's `lr_backbone`."""
@@ -220,7 +226,8 @@ class TrainableModel(abc.ABC):
             labels=recipe.labels,
             realign=recipe.realign,
             width=recipe.picture,
-            height=recipe.picture,
+            height=recipe.height,
+            fit="native" if recipe.cut_pad else facts.fit,
             family=recipe.family,
             recipe=recipe.name,
         ).write(folder)
@@ -242,6 +249,15 @@ class TrainableModel(abc.ABC):
 
     def _processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         return make_pre_post_processors(self.policy.config, dataset_stats=self.stats)
+
+
+def valid_mean(errors: torch.Tensor, batch: Mapping[str, object]) -> Losses:
+    """Mean of errors [B, n, 40] that are not padding."""
+    pad = batch[PAD]
+    assert isinstance(pad, torch.Tensor)
+    valid = ~pad.unsqueeze(-1)
+    kept, count = errors * valid, (valid.sum() * errors.shape[-1]).clamp_min(1)
+    return kept.sum() / count, kept.detach().sum(dim=(1, 2)) * (len(errors) / count)
 
 
 def new_policy(config: PreTrainedConfig) -> PreTrainedPolicy:

@@ -8,14 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from arena_newton.policies.lerobot.checkpoint_facts import vector_of
 from arena_newton.policies.train.frames.augmentation import gathered_pictures
 from arena_newton.policies.train.frames.demonstration_rows import ACTION_KEY, CAMERA_KEY, STATE_KEY, VECTOR_KEY
 from arena_newton.policies.train.frames.frame_store import FrameStore
 
-__all__ = ["BatchMaker", "RowOrder", "step_seed"]
+__all__ = ["BalancedOrder", "BatchMaker", "RowOrder", "step_seed"]
 
 MIX = 0x9E3779B97F4A7C15
 """Odd number by which steps are spread over the seeds (the golden ratio of 2^64, as in splitmix64)."""
+UNKNOWN_FRACTION = 0.05
+"""Fraction of the training samples whose tracker is said to be another than those of the vector: for play through one
+of which there are no demonstrations."""
 
 
 def step_seed(seed: int, step: int, rank: int = 0) -> int:
@@ -62,6 +66,38 @@ class RowOrder:
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
+class BalancedOrder:
+    """Rows drawn independently: first a group of them, by its weight, then any of the group's rows.
+
+    Drawn on the CPU from seed, step and process alone, as the order of `RowOrder` is.
+    """
+
+    def __init__(
+        self, samples: np.ndarray, groups: np.ndarray, weights: Sequence[float], seed: int, device: torch.device
+    ):
+        """Sort the rows by their groups.
+
+        Args:
+            samples: Rows at which samples may begin, int64.
+            groups: Group of each, int64.
+            weights: Of each group, all of which have rows.
+            seed: Of the draws.
+            device: Where the rows are wanted.
+        """
+        self._samples = torch.from_numpy(samples[np.argsort(groups, kind="stable")])
+        self._counts = torch.from_numpy(np.bincount(groups, minlength=len(weights)))
+        self._starts = self._counts.cumsum(0) - self._counts
+        self._weights = torch.tensor(weights, dtype=torch.float64)
+        self._seed, self._device = seed, device
+
+    def rows(self, step: int, batch: int, *, rank: int = 0, ranks: int = 1) -> torch.Tensor:
+        """Rows of a step of one process, int64, shape [batch]; `ranks` does not count."""
+        generator = torch.Generator().manual_seed(step_seed(self._seed, step, rank=-3 - rank))
+        group = torch.multinomial(self._weights, batch, replacement=True, generator=generator)
+        within = torch.rand(batch, dtype=torch.float64, generator=generator) * self._counts[group]
+        return self._samples[self._starts[group] + within.long()].to(self._device)
+
+
 @dataclass
 class BatchMaker:
     """Makes normalized batches of rows; nothing in it waits for the device."""
@@ -73,6 +109,10 @@ class BatchMaker:
     """Ticks of the actions of a sample, counted from its row."""
     task_vector: Sequence[str] = ()
     """Tasks in the order of the one-hot vector; none: no vector."""
+    tracker_vector: Sequence[str] = ()
+    """Trackers in the order of the numbers that follow in it, as of `CheckpointFacts`; none: it has no such numbers."""
+    tall: int = 0
+    """As of `gathered_pictures`."""
     tokens: Mapping[str, torch.Tensor] | None = None
     """Tokens of language of every instruction, or of every row: key → shape [instructions or rows, L]."""
     tokens_per_row: bool = False
@@ -82,11 +122,20 @@ class BatchMaker:
         """Make the constants."""
         device = self.store.device
         self._offsets = torch.tensor(list(self.offsets), device=device)
-        numbers = [self.task_vector.index(task) if self.task_vector else 0 for task in self.store.tasks]
-        self._vectors = torch.eye(max(1, len(self.task_vector)), device=device)[torch.tensor(numbers, device=device)]
+        told = [[(task, tracker), (task, "")] for task, tracker in self.store.pairs]
+        vectors = [[vector_of(self.task_vector, self.tracker_vector, *one) for one in both] for both in told]
+        self._vectors = torch.tensor(vectors, device=device)
+        """Vector of each pair, and that of its task with an unknown tracker, shape [pairs, 2, width]."""
 
     def __call__(
-        self, rows: torch.Tensor, *, shift: int = 0, colour: float = 0.0, transforms: bool = False
+        self,
+        rows: torch.Tensor,
+        *,
+        looks: bool = False,
+        shift: int = 0,
+        colour: float = 0.0,
+        transforms: bool = False,
+        unknown: float = 0.0,
     ) -> dict[str, torch.Tensor]:
         """The batch of rows.
 
@@ -94,24 +143,33 @@ class BatchMaker:
 
         Args:
             rows: int64, shape [B].
+            looks: Change the looks of a part of the samples, which may then begin a few rows earlier.
             shift: Most pixels by which a picture is shifted.
             colour: Most relative change of brightness and colours.
             transforms: Apply LeRobot's image transforms.
+            unknown: Fraction of the samples whose tracker the vector does not name.
 
         Returns:
             `observation.images.front` [B, 3, H, W], `observation.state` [B, 64], `action` [B, n, 40], `action_is_pad`
             bool [B, n]; the task vector and tokens of language where the policy takes them.
         """
-        store = self.store
+        store, changed = self.store, None
+        if looks and store.looks is not None:
+            rows, changed = store.looks.chosen(rows)
         wanted = rows[:, None] + self._offsets
         inside = torch.minimum(torch.maximum(wanted, store.first[rows][:, None]), store.last[rows][:, None])
         batch = {
-            CAMERA_KEY: gathered_pictures(store, rows, shift=shift, colour=colour, transforms=transforms),
+            CAMERA_KEY: gathered_pictures(
+                store, rows, changed=changed, tall=self.tall, shift=shift, colour=colour, transforms=transforms
+            ),
             STATE_KEY: store.states[rows],
             ACTION_KEY: store.actions[inside],
         }
         if self.task_vector:
-            batch[VECTOR_KEY] = self._vectors[store.task[rows]]
+            hidden = torch.zeros_like(rows)
+            if self.tracker_vector and unknown:
+                hidden = (torch.rand(len(rows), device=store.device) < unknown).long()
+            batch[VECTOR_KEY] = self._vectors[store.pair[rows], hidden]
         batch = {key: self.normalise(key, value) for key, value in batch.items()}
         batch["action_is_pad"] = wanted != inside
         for key, tokens in (self.tokens or {}).items():

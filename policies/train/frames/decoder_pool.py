@@ -13,9 +13,7 @@ import json
 import mmap
 import os
 import selectors
-import signal
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +28,7 @@ import torch
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.interrupts import Uninterrupted
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended, start_module
 from arena_newton.files.pinned_memory import pin, unpin
 from arena_newton.policies.train.frames.decoder_process import SLOTS, EpisodeDecoder, chunk, mapped
 
@@ -66,7 +64,9 @@ class EpisodeFilm:
     """Number of the first one in the film."""
     frames: int
     row: int
-    """Row of the first one."""
+    """Number of the first one among all that are wanted."""
+    every: int = 1
+    """Pictures of the film from one that is wanted to the next."""
 
     def __str__(self) -> str:
         return f"{self.root}: episode {self.episode}"
@@ -155,20 +155,10 @@ class DecoderPool:
         variables = environment(one_thread=True)
         for number in range(count):
             facts = self._fd, number, self._slot, height, width
-            command = [sys.executable, "-P", "-m", PROGRAM, *map(str, facts)]
             with self._whole:
                 try:
                     slots = mapped(self._fd, number, self._slot)
-                    # A session of its own: Ctrl-C is the training's, which ends its processes itself.
-                    process = subprocess.Popen(
-                        command,
-                        pass_fds=(self._fd,),
-                        env=variables,
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.PIPE,
-                        bufsize=0,
-                        start_new_session=True,
-                    )
+                    process = start_module(PROGRAM, *facts, files=[self._fd], variables=variables, pipes=True)
                 except OSError:  # the user's limit of processes, or of memory: those that there are decode
                     break
                 self._workers.append(_Worker(process, slots))
@@ -223,7 +213,7 @@ class DecoderPool:
             for start in range(0, film.frames, most):
                 pictures = own.pictures[: min(most, film.frames - start)]
                 try:
-                    decoder.fill(film.path, film.first + start, pictures)
+                    decoder.fill(film.path, film.first + start * film.every, pictures, film.every)
                 except InputError as error:
                     raise InputError(f"{film}: {error}") from error
                 put(film.row + start, pictures)
@@ -249,7 +239,7 @@ class DecoderPool:
             worker.film = waiting.popleft() if waiting else -1
             if worker.film >= 0:
                 film = films[worker.film]
-                about = {"path": str(film.path), "first": film.first, "frames": film.frames}
+                about = {"path": str(film.path), "first": film.first, "frames": film.frames, "every": film.every}
                 _tell(worker, about | {"top": top, "bottom": bottom})
 
         left = len(films)
@@ -289,7 +279,9 @@ class DecoderPool:
         part = os.read(worker.process.stdout.fileno(), 1 << 16)
         if not part:
             where = f"{films[worker.film]}: " if worker.film >= 0 else ""
-            raise ArenaError(f"{where}the process that decodes pictures ended ({_how(worker.process)})")
+            raise ArenaError(
+                f"{where}the process that decodes pictures ended ({how_it_ended(worker.process, DEATH_PATIENCE)})"
+            )
         worker.received += part
         *lines, rest = worker.received.split(b"\n")
         worker.received = bytearray(rest)
@@ -329,15 +321,3 @@ def _tell(worker: _Worker, message: dict[str, object]) -> None:
     assert worker.process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
         worker.process.stdin.write(json.dumps(message).encode() + b"\n")
-
-
-def _how(process: subprocess.Popen[bytes]) -> str:
-    """Ending of a process, in words."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(DEATH_PATIENCE)
-    code = process.returncode
-    if code is None:
-        return "it closed its output"
-    if code >= 0:
-        return f"exit code {code}"
-    return f"{signal.Signals(-code).name}{'; out of memory?' if -code == signal.SIGKILL else ''}"

@@ -52,13 +52,14 @@ class EpisodeDecoder:
         width = self._shape[1]
         self._above, self._below = np.zeros((top, width, 3), np.uint8), np.zeros((bottom, width, 3), np.uint8)
 
-    def fill(self, path: Path, first: int, pictures: np.ndarray) -> None:
+    def fill(self, path: Path, first: int, pictures: np.ndarray, every: int = 1) -> None:
         """Decode as many pictures as there is room for.
 
         Args:
             path: The film.
             first: Number of the first one in it.
             pictures: Where they are wanted without the rows that are cut off, uint8, shape [N, rows, width, 3].
+            every: Pictures of the film from one to the next.
 
         Raises:
             InputError: The film lacks one, cannot be decoded, or has pictures of another size.
@@ -66,10 +67,10 @@ class EpisodeDecoder:
         top, end = len(self._above), self._shape[0] - len(self._below)
         try:
             video = self._opened(path)
-            if first + len(pictures) > len(video.times):
-                raise InputError(f"{path}: has {len(video.times)} frames, none is {first + len(pictures) - 1}")
+            if (last := first + (len(pictures) - 1) * every) >= len(video.times):
+                raise InputError(f"{path}: has {len(video.times)} frames, none is {last}")
             for number in range(len(pictures)):
-                picture = video.read(first + number)
+                picture = video.read(first + number * every)
                 if picture.shape != self._shape:
                     raise InputError(f"{path}: a picture has shape {list(picture.shape)}, expected {list(self._shape)}")
                 pictures[number] = picture[top:end]
@@ -143,7 +144,8 @@ class _Decoding:
     def _decode(self, episode: Mapping[str, object]) -> bool:
         """Decode an episode; False where the training has ended, or it cannot be decoded."""
         path = Path(cast("str", episode["path"]))
-        first, frames, top, bottom = (cast("int", episode[name]) for name in ("first", "frames", "top", "bottom"))
+        names = ("first", "frames", "every", "top", "bottom")
+        first, frames, every, top, bottom = (cast("int", episode[name]) for name in names)
         shape = self._height - top - bottom, self._width, 3
         most = chunk(self._slot, shape)
         self._decoder.begin(top, bottom)
@@ -154,7 +156,7 @@ class _Decoding:
             slot, count = self._free.popleft(), min(most, frames - start)
             pictures = np.ndarray((count, *shape), np.uint8, self._memory, slot * self._slot)
             try:
-                self._decoder.fill(path, first + start, pictures)
+                self._decoder.fill(path, first + start * every, pictures, every)
             except InputError as error:
                 _say({"error": str(error)})
                 return False

@@ -14,6 +14,7 @@ from arena_newton.data.datasets.row_statistics import aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import DatasetFiles, read_json
 from arena_newton.data.readers.label_protocols import LABELS, action_names, decode_v4, encode_v4
 from arena_newton.data.readers.lerobot_reader import DatasetActions
+from arena_newton.data.readers.looks import LOOKS_FOLDER
 from arena_newton.errors import InputError
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
@@ -33,7 +34,7 @@ STATE_KEY, ACTION_KEY = "observation.state", "action"
 CAMERA_KEY = "observation.images.front"
 """Name of the head camera's pictures."""
 VECTOR_KEY = "observation.environment_state"
-"""Name of the one-hot vector of tasks: LeRobot's networks take it as a token of its own."""
+"""Name of the one-hot vector of task and tracker: LeRobot's networks take it as a token of its own."""
 STATISTICS = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 """Those of a feature that normalization may use."""
 
@@ -49,6 +50,8 @@ class EpisodeRows:
     instruction: str
     task: str
     """Name of our task; empty where the dataset does not tell."""
+    tracker: str = ""
+    """Name of the tracker through which it was recorded; empty where the dataset does not tell."""
 
     @property
     def length(self) -> int:
@@ -134,7 +137,8 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
         task = seeds[row.index].task if seeds else about.task(row.index) or ""
         wanted = converted(actions[row.index], about.labels, labels)
         instruction = row.tasks[0] if row.tasks else ""
-        episodes.append(EpisodeRows(states[row.index], wanted, instruction, task))
+        tracker = seeds[row.index].tracker if seeds else ""
+        episodes.append(EpisodeRows(states[row.index], wanted, instruction, task, tracker))
     return DatasetRows(
         root=files.root,
         episodes=tuple(episodes),
@@ -148,7 +152,7 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
 
 
 def content_hash(files: DatasetFiles, states: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> str:
-    """SHA-256 over `meta/info.json`, `meta/stats.json` (of the pictures too) and every number of states and actions.
+    """SHA-256 over `meta/info.json`, `meta/stats.json` (of pictures too), the list of looks, states and actions.
 
     `info.json` of the original's datasets says no more than how many episodes and rows there are.
     """
@@ -156,6 +160,9 @@ def content_hash(files: DatasetFiles, states: Sequence[np.ndarray], actions: Seq
     statistics_file = files.root / "meta" / "stats.json"
     if statistics_file.is_file():
         digest.update(statistics_file.read_bytes())
+    looks = files.root / LOOKS_FOLDER / "looks.json"
+    if looks.is_file():
+        digest.update(looks.read_bytes())
     for numbers in (*states, *actions):
         digest.update(np.ascontiguousarray(numbers).tobytes())
     return digest.hexdigest()

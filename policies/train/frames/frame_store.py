@@ -1,7 +1,7 @@
-"""All pictures, states and actions of datasets on one device: decoded once, read by index.
+"""Pictures, states and actions of datasets on one device: decoded once, read by index.
 
-Pictures are uint8. Rows that are black in every picture, above and below a padded 4:3 picture, are cut off and put back
-when a batch is made: a quarter of the memory.
+Pictures are uint8, of every tick or of every Nth. Rows that are black in every picture, above and below a padded 4:3
+picture, are cut off, and put back when a batch is made for a network that sees them: a quarter of the memory.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +28,9 @@ from arena_newton.policies.train.frames.demonstration_rows import (
 )
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
+if TYPE_CHECKING:
+    from arena_newton.policies.train.frames.look_store import LookStore
+
 __all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
 
 BLACK = 12
@@ -40,7 +44,9 @@ class FrameStore:
     """Rows of all episodes, one after the other, on one device."""
 
     pictures: torch.Tensor
-    """uint8, shape [rows, height - top - bottom, width, 3]."""
+    """uint8, shape [pictures, height - top - bottom, width, 3]."""
+    picture: torch.Tensor
+    """Number of each row's picture, of a row without one that of the last before it, int64, shape [rows]."""
     states: torch.Tensor
     """float32, shape [rows, 64]."""
     actions: torch.Tensor
@@ -53,9 +59,13 @@ class FrameStore:
     """Number of each row's instruction, int64, shape [rows]."""
     task: torch.Tensor
     """Number of each row's task, int64, shape [rows]."""
+    pair: torch.Tensor
+    """Number of each row's pair of task and tracker, int64, shape [rows]."""
     instructions: tuple[str, ...]
     tasks: tuple[str, ...]
     """Names of tasks, sorted."""
+    pairs: tuple[tuple[str, str], ...]
+    """Task and tracker of each pair, sorted."""
     lengths: tuple[int, ...]
     """Rows of each episode."""
     held: tuple[bool, ...]
@@ -64,6 +74,10 @@ class FrameStore:
     """Black rows above [px]."""
     bottom: int
     """Black rows below [px]."""
+    every: int = 1
+    """Rows from one picture of an episode to the next; the first row has one."""
+    looks: LookStore | None = None
+    """Looks of the pictures, where a training changes them."""
 
     @property
     def device(self) -> torch.device:
@@ -76,6 +90,12 @@ class FrameStore:
         return len(self.states)
 
     @property
+    def pair_names(self) -> tuple[str, ...]:
+        """Names of the pairs: that of the task and, where there are several trackers, that of the tracker."""
+        several = len({tracker for _, tracker in self.pairs}) > 1
+        return tuple("_".join(name or "unknown" for name in pair[: 1 + several]) for pair in self.pairs)
+
+    @property
     def height(self) -> int:
         """Height of a whole picture [px]."""
         return int(self.pictures.shape[1]) + self.top + self.bottom
@@ -85,8 +105,21 @@ class FrameStore:
         """Width of a picture [px]."""
         return int(self.pictures.shape[2])
 
+    def middle(self, height: int) -> tuple[torch.Tensor, int]:
+        """Pictures cut to a height about their middle.
+
+        Args:
+            height: At most that of a whole picture [px].
+
+        Returns:
+            The rows of it that are stored, uint8, shape [pictures, at most height, width, 3], a view; and the number
+            of black ones above them that are not.
+        """
+        first = (self.height - height) // 2 - self.top
+        return self.pictures[:, max(0, first) : max(0, first + height)], max(0, -first)
+
     def samples(self, *, held: bool = False, drop_last: int = 0) -> np.ndarray:
-        """Rows at which a sample may begin.
+        """Rows at which a sample may begin: those with a picture.
 
         Args:
             held: Those of held-out episodes instead of the others.
@@ -97,16 +130,16 @@ class FrameStore:
         """
         starts = np.cumsum([0, *self.lengths])
         parts = [
-            np.arange(start, start + length - drop_last)
+            np.arange(start, start + length - drop_last, self.every)
             for start, length, out in zip(starts, self.lengths, self.held, strict=False)
             if out == held and length > drop_last
         ]
         return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 
-def needed_memory(frames: int, height: int, width: int) -> int:
-    """Bytes of so many rows."""
-    return frames * (height * width * 3 + 4 * (STATE_WIDTH + ACTION_WIDTH) + 4 * 8)
+def needed_memory(pictures: int, rows: int, height: int, width: int) -> int:
+    """Bytes of so many pictures and rows."""
+    return pictures * height * width * 3 + rows * (4 * (STATE_WIDTH + ACTION_WIDTH) + 6 * 8)
 
 
 def free_memory(device: torch.device) -> int:
@@ -120,18 +153,18 @@ def free_memory(device: torch.device) -> int:
     return 2**62
 
 
-def check_memory(frames: int, height: int, width: int, device: torch.device, network: int) -> None:
+def check_memory(pictures: int, rows: int, height: int, width: int, device: torch.device, network: int) -> None:
     """Refuse what does not fit beside a network that needs so many bytes.
 
     Raises:
         InputError: The device has too little free memory; the message says how much is missing.
     """
-    needed, free = needed_memory(frames, height, width), free_memory(device) - network
+    needed, free = needed_memory(pictures, rows, height, width), free_memory(device) - network
     if needed > free:
         raise InputError(
-            f"--dataset: {frames} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
+            f"--dataset: {pictures} pictures of {width}x{height} need {needed / 1e9:.1f} GB of memory on {device}, "
             f"{max(0, free) / 1e9:.1f} GB are free beside the network, for which {network / 1e9:.1f} GB are kept: name "
-            "fewer datasets, record smaller pictures, or use a device with more memory"
+            "fewer datasets, a larger --picture-every, record smaller pictures, or use a device with more memory"
         )
 
 
@@ -140,21 +173,23 @@ def load_frames(
     device: torch.device,
     *,
     hold_out: int = 0,
+    every: int = 1,
     jobs: int = 0,
     processes: int | None = None,
     network: int = 0,
     on_frames: Callable[[int], None] = lambda count: None,
 ) -> FrameStore:
-    """Decode all pictures onto a device.
+    """Decode pictures onto a device.
 
     Args:
         datasets: Read with `read_rows`; their pictures must have one size.
         device: Where the rows are wanted.
         hold_out: Last episodes of each dataset that are held out.
+        every: Rows from one picture of an episode to the next.
         jobs: Cores that decode, an episode each; 0: all that the process may use.
         processes: Processes that decode instead of threads; by default as `decoding_processes` says.
         network: Memory that the network needs beside the pictures [bytes] (`network_bytes`).
-        on_frames: Is told after each episode how many pictures were decoded.
+        on_frames: Receives after each episode how many pictures were decoded.
 
     Raises:
         InputError: The pictures differ in size, do not fit, or cannot be decoded; or no episode is left to train on.
@@ -172,15 +207,16 @@ def load_frames(
             raise InputError(
                 f"--hold-out {hold_out}: {dataset.root} has {len(dataset.episodes)} episodes, none would be left"
             )
-    frames = sum(dataset.frames for dataset in datasets)
+    rows = sum(dataset.frames for dataset in datasets)
+    films = episode_films(datasets, every)
+    count = sum(film.frames for film in films)
     cores = jobs or len(os.sched_getaffinity(0))
-    count = decoding_processes(cores, frames) if processes is None else processes
-    films = episode_films(datasets)
-    with DecoderPool(height, width, threads=cores, processes=count, device=device) as pool:
+    processes = decoding_processes(cores, count) if processes is None else processes
+    with DecoderPool(height, width, threads=cores, processes=processes, device=device) as pool:
         top, bottom = black_rows(pool, films, height)
         while True:
-            check_memory(frames, height - top - bottom, width, device, network)
-            pictures = torch.empty((frames, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
+            check_memory(count, rows, height - top - bottom, width, device, network)
+            pictures = torch.empty((count, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
             black = _decode(pool, films, pictures, (top, bottom), on_frames)
             if black == (top, bottom):
                 break
@@ -189,18 +225,19 @@ def load_frames(
             (top, bottom), on_frames = black, lambda count: None
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]
-    return assembled(episodes, pictures, held, top, bottom)
+    return assembled(episodes, pictures, held, top, bottom, every)
 
 
-def episode_films(datasets: Sequence[DatasetRows]) -> list[EpisodeFilm]:
-    """Video files and time ranges of all episodes' pictures, and their rows."""
+def episode_films(datasets: Sequence[DatasetRows], every: int = 1) -> list[EpisodeFilm]:
+    """Video files and time ranges of all episodes' pictures, and where they are wanted."""
     found: list[EpisodeFilm] = []
     row = 0
     for dataset in datasets:
         parts = Frames(dataset.root, dataset.camera).parts[: len(dataset.episodes)]
         for number, (episode, part) in enumerate(zip(dataset.episodes, parts, strict=True)):
-            found.append(EpisodeFilm(dataset.root, number, part.path, part.first, part.frames, row))
-            row += episode.length
+            count = -(-episode.length // every)
+            found.append(EpisodeFilm(dataset.root, number, part.path, part.first, count, row, every))
+            row += count
     return found
 
 
@@ -238,32 +275,44 @@ def _decode(
 
 
 def assembled(
-    episodes: Sequence[EpisodeRows], pictures: torch.Tensor, held: Sequence[bool], top: int, bottom: int
+    episodes: Sequence[EpisodeRows],
+    pictures: torch.Tensor,
+    held: Sequence[bool],
+    top: int,
+    bottom: int,
+    every: int = 1,
 ) -> FrameStore:
     """Rows of episodes next to their pictures."""
     device = pictures.device
     lengths = np.array([episode.length for episode in episodes])
     ends = np.cumsum(lengths)
+    counts = -(-lengths // every)
+    within = np.arange(ends[-1]) - np.repeat(ends - lengths, lengths)
     instructions = tuple(sorted({episode.instruction for episode in episodes}))
     tasks = tuple(sorted({episode.task for episode in episodes}))
+    pairs = tuple(sorted({(episode.task, episode.tracker) for episode in episodes}))
 
     def per_row(values: Iterator[int] | np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.repeat(np.fromiter(values, np.int64, len(episodes)), lengths)).to(device)
 
     return FrameStore(
         pictures=pictures,
+        picture=per_row(np.cumsum(counts) - counts) + torch.from_numpy(within // every).to(device),
         states=torch.from_numpy(np.concatenate([e.states for e in episodes])).to(device),
         actions=torch.from_numpy(np.concatenate([e.actions for e in episodes])).to(device),
         first=per_row(ends - lengths),
         last=per_row(ends - 1),
         instruction=per_row(instructions.index(e.instruction) for e in episodes),
         task=per_row(tasks.index(e.task) for e in episodes),
+        pair=per_row(pairs.index((e.task, e.tracker)) for e in episodes),
         instructions=instructions,
         tasks=tasks,
+        pairs=pairs,
         lengths=tuple(lengths.tolist()),
         held=tuple(held),
         top=top,
         bottom=bottom,
+        every=every,
     )
 
 
@@ -284,7 +333,7 @@ def made_frames(
         InputError: They do not fit.
     """
     band = size // 8
-    check_memory(frames, size - 2 * band, size, device, network)
+    check_memory(frames, frames, size - 2 * band, size, device, network)
     generator = torch.Generator(device).manual_seed(seed)
     pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
     for start in range(0, frames, length):

@@ -296,7 +296,7 @@ def test_a_package_that_is_not_installed_has_no_version(recordings, tmp_path, mo
 
 
 def test_a_disk_that_is_full_at_the_end_leaves_nothing(recordings, tmp_path, monkeypatch, capsys):
-    """Where the table of episodes cannot be written: exit code 2, and nothing writes into the removed folder later."""
+    """A table of episodes that cannot be written: exit code 2, and nothing writes into the removed folder later."""
     with monkeypatch.context() as patch:
 
         def full(_):
@@ -310,7 +310,7 @@ def test_a_disk_that_is_full_at_the_end_leaves_nothing(recordings, tmp_path, mon
 
 
 def test_a_full_disk_is_one_error(recordings, tmp_path, monkeypatch):
-    """Where a video cannot be copied the error names the dataset, and nothing of it stays."""
+    """The error of a video that cannot be copied names the dataset, and nothing of it stays."""
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -322,7 +322,7 @@ def test_a_full_disk_is_one_error(recordings, tmp_path, monkeypatch):
 
 
 def test_private_names_of_lerobot():
-    """What the build uses of LeRobot without a promise is there, with the meaning that it relies on."""
+    """Private names of LeRobot that the build uses are there, with the meaning that it relies on."""
     lerobot_dataset.check_version()
     source = inspect.getsource(dataset_writer.DatasetWriter)
     assert "self._streaming_encoder = streaming_encoder" in source

@@ -171,7 +171,7 @@ def still(folder, *, executed, repeat=0, seeds=seeding.TELEOPERATION):
 
 
 def test_a_repeated_label_is_no_held_action(tmp_path, capsys):
-    """What was executed is judged, not the label; a policy that stands is not, and a stalled source is."""
+    """Executed actions are judged, not the label; a policy that stands is not, and a stalled source is."""
     folder, held = tmp_path / "recorded", np.zeros((40, 40), np.float32)
     moving = np.arange(40, dtype=np.float32)[:, None] * np.ones((1, 40), np.float32)
     sound = [

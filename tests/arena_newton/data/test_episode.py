@@ -133,7 +133,7 @@ def test_an_episode_without_a_success_can_be_left_out(env, tmp_path):
 
 
 def test_closing_in_the_middle_leaves_no_file(env, tmp_path):
-    """What runs when the recorder is closed is dropped, videos and depth included."""
+    """Episodes that run when the recorder is closed are dropped, videos and depth included."""
     recorder = DemonstrationRecorder(tmp_path, cameras={"front": CameraConfig(32, 32)}, depth=True, threads=2)
 
     class Stop(Exception):

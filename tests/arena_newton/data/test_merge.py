@@ -57,7 +57,7 @@ def rows(root):
 
 
 def near(one, other):
-    """Whether two JSON values are the same but for rounding."""
+    """True if two JSON values are the same but for rounding."""
     if isinstance(one, dict):
         return set(one) == set(other) and all(near(one[key], other[key]) for key in one)
     if isinstance(one, list):
@@ -238,7 +238,7 @@ def test_a_side_depends_on_the_seed_alone():
 
 
 def test_parts_and_whole_are_split_alike(built, tmp_path, capsys):
-    """What of recordings, of a dataset and of a merged one is held out are the same episodes; nothing is lost."""
+    """Recordings, their dataset and a merged one hold out the same episodes; nothing is lost."""
     merged = tmp_path / "m"
     assert main(["merge", str(built / "b"), str(built / "a"), "--out", str(merged)]) == 0
     sides = {}

@@ -293,7 +293,7 @@ ALONE = [
 
 @pytest.mark.parametrize("fault", ALONE)
 def test_faults_are_found_without_recordings(fault, dataset):
-    """What contradicts itself is found in the dataset alone."""
+    """Contradictions of a dataset with itself are found without recordings."""
     FAULTS[fault][0](dataset)
     with pytest.raises(DatasetMismatch):
         check(dataset)

@@ -114,8 +114,8 @@ def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.0
         "action": {"mean": stand, "std": torch.full((40,), spread)},
     }
     if facts is not None and facts.task_vector:
-        features[TASK] = PolicyFeature(FeatureType.ENV, (len(facts.task_vector),))
-        stats[TASK] = {"mean": torch.zeros(len(facts.task_vector)), "std": torch.ones(len(facts.task_vector))}
+        features[TASK] = PolicyFeature(FeatureType.ENV, (facts.vector_width,))
+        stats[TASK] = {"mean": torch.zeros(facts.vector_width), "std": torch.ones(facts.vector_width)}
     config = configuration(family, features, clip, **changes)
     policy = get_policy_class(config.type)(config)
     for parameter in policy.parameters():  # some begin at 0, which would hide what they are multiplied with
@@ -130,12 +130,12 @@ def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.0
 
 
 def facts(**changes):
-    """What a checkpoint of ours says, with tiny pictures."""
+    """Facts of a checkpoint of ours, with tiny pictures."""
     return CheckpointFacts(**{"width": SIDE, "height": SIDE} | changes)
 
 
-def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing"):
-    """What worlds show: it follows from each world's seed and tick alone."""
+def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="twist2"):
+    """Observation of worlds, which follows from each world's seed and tick alone."""
     state, pictures = [], []
     for key in zip(seeds, ticks, strict=True):
         rng = np.random.default_rng(key)
@@ -148,16 +148,17 @@ def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing"):
         task=task,
         gym_id=task,
         instruction="Strike the green markers on the punching bag.",
+        tracker=tracker,
     )
 
 
-def follow(policy, seeds, looks, *, asks=None, side=(SIDE, SIDE)):
-    """Actions of each world by seed, tick by tick, over `looks` answers of full length.
+def follow(policy, seeds, queries, *, asks=None, side=(SIDE, SIDE)):
+    """Actions of each world by seed, tick by tick, over `queries` answers of full length.
 
     Args:
         policy: Is reset.
         seeds: Episode seeds of the worlds.
-        looks: Ticks that are played are `looks` times the policy's chunk.
+        queries: Ticks that are played are `queries` times the policy's chunk.
         asks: World → tick at which its episode begins, so that worlds ask at different ticks.
         side: Height and width of pictures.
     """
@@ -166,7 +167,7 @@ def follow(policy, seeds, looks, *, asks=None, side=(SIDE, SIDE)):
     policy.reset(seeds, ["boxing"] * worlds)
     ticks, left = [0] * worlds, [[] for _ in range(worlds)]
     played = [[] for _ in range(worlds)]
-    total = looks * policy.chunk_size
+    total = queries * policy.chunk_size
     for now in range(total + max(begins)):
         acting = [now >= begin and ticks[w] < total for w, begin in enumerate(begins)]
         mask = [acting[w] and not left[w] for w in range(worlds)]

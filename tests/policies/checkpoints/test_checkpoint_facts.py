@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself is read back, and damage is one clear error."""
+"""Facts of a checkpoint are read back, and damage is one clear error."""
 
 import json
 import random
@@ -9,8 +9,9 @@ from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import FACTS_FILE, CheckpointFacts, checkpoint_folder
 
 FACTS = CheckpointFacts(
-    labels="v4", realign=0.002, width=128, height=96, fit="native", task_vector=("boxing", "vis_navi"), family="act",
-    recipe="fast", tasks=("boxing",), trackers=("twist2",), steps=10, seed=42, minutes=1.5, device="cpu",
+    labels="v4", realign=0.002, width=128, height=96, fit="native", task_vector=("boxing", "vis_navi"),
+    tracker_vector=("sonic", "twist2"), family="act", recipe="fast", tasks=("boxing",), trackers=("twist2",), steps=10,
+    seed=42, minutes=1.5, device="cpu",
     datasets=({"name": "boxing", "hash": "abc", "episodes": 3, "frames": 90},), options={"batch": 8},
 )  # fmt: skip
 
@@ -21,6 +22,8 @@ def test_facts_are_read_as_written(tmp_path):
     FACTS.write(tmp_path)
     assert CheckpointFacts.read(tmp_path) == FACTS
     assert FACTS.camera.width == 128 and FACTS.camera.fit == "native"
+    assert FACTS.vector("vis_navi", "sonic") == [0, 1, 1, 0, 0] and FACTS.vector("boxing", "new") == [1, 0, 0, 0, 1]
+    assert FACTS.vector_width == 5 and CheckpointFacts(task_vector=("boxing",)).vector("boxing", "sonic") == [1]
 
 
 def test_a_folder_of_a_training_names_its_last_checkpoint(tmp_path):

@@ -34,7 +34,7 @@ TRANSFORMS = {
         "pad": {"weight": 1.0, "type": "Pad", "kwargs": {"padding": [0, 8, 0, 8], "fill": 0}},
     },
 }
-"""What the original's training does to 640x480 pictures, at a size for tests."""
+"""Preparation of 640x480 pictures in the original's training, at a size for tests."""
 
 
 @pytest.fixture
@@ -283,7 +283,7 @@ CONSTANT = {
 @pytest.mark.parametrize("mode", CONSTANT)
 @pytest.mark.parametrize(("feature", "part"), [(STATE, "pre"), ("action", "post")])
 def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, feature, part):
-    """They make noise of every look, or one action of every answer; a feature of which one number changes is taken."""
+    """They make noise of every query, or one action of every answer; a feature of which one number changes is taken."""
     made, said = CONSTANT[mode]
     modes = {kind: mode for kind in ("VISUAL", "STATE", "ACTION", "ENV")} | {"VISUAL": "MEAN_STD"}
     edit(folder / "config.json", normalization_mapping=modes)

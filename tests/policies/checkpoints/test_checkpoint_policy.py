@@ -35,7 +35,7 @@ def test_results_do_not_depend_on_the_number_of_worlds(made, family):
 
 @pytest.mark.parametrize("family", ["diffusion", "flow", "two"])
 def test_the_global_generator_has_no_say(made, family):
-    """Drawing numbers between looks changes nothing, and a policy leaves the global generator as it found it."""
+    """Drawing numbers between queries changes nothing, and a policy leaves the global generator as it found it."""
     policy = made[family]
     before = follow(policy, SEEDS[:2], 2)
     state = torch.get_rng_state()
@@ -49,7 +49,7 @@ def test_the_global_generator_has_no_say(made, family):
 
 @pytest.mark.parametrize("family", ["diffusion", "flow"])
 def test_noise_is_an_episodes_own(made, family):
-    """The same picture gives another answer to another seed and at another look, and the same again after a reset."""
+    """The same picture gives another answer to another seed and at another query, and the same again after a reset."""
     policy = made[family]
 
     def answers(seed):
@@ -79,7 +79,7 @@ def test_an_answer_is_what_lerobot_computes(made, checkpoints):
 
 @pytest.mark.parametrize("family", ["diffusion", "flow"])
 def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
-    """Where the global generator is set as an episode's, LeRobot's own sampling gives the same actions."""
+    """LeRobot's own sampling gives the same actions once the global generator is set as an episode's."""
     from arena_newton.policies.lerobot import checkpoint_network
     from arena_newton.policies.lerobot.network_noise import Draw, generators
 
@@ -108,7 +108,7 @@ def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
 
 
 def test_two_ticks_are_looked_at(made, monkeypatch):
-    """A policy of two observations is shown the tick before its look, and at first the same tick twice."""
+    """A policy of two observations is shown the tick before its query, and at first the same tick twice."""
     policy, given = made["two"], []
     predict = policy._network.predict
 
@@ -130,10 +130,10 @@ def test_replan_executes_the_first_actions(made, checkpoints):
     policy = policies.get(f"lerobot:{checkpoints['act']}", replan=2)
     assert policy.chunk_size == 2
     rows = follow(policy, [11], 3)[11]
-    for look in range(3):
+    for query in range(3):
         made["act"].reset([11], ["boxing"])
-        whole = made["act"].act(seen([11], [2 * look])).actions[0]
-        assert torch.equal(rows[2 * look : 2 * look + 2], whole[:2])
+        whole = made["act"].act(seen([11], [2 * query])).actions[0]
+        assert torch.equal(rows[2 * query : 2 * query + 2], whole[:2])
     with pytest.raises(InputError, match=r"--replan 11: expected 1 to 10"):
         LeRobotPolicy(checkpoints["act"], replan=11)
 
@@ -183,6 +183,19 @@ def test_the_task_vector_names_the_task(tmp_path):
     assert not torch.equal(*answers)
     with pytest.raises(InputError, match="was trained on boxing, vis_navi, not on football"):
         policy.check_task("football")
+
+
+def test_the_task_vector_names_the_tracker(tmp_path):
+    """Each tracker has its own answer to the same picture; those that the vector does not name have one of theirs."""
+    vectors = {"task_vector": ("boxing",), "tracker_vector": ("sonic", "twist2")}
+    policy = LeRobotPolicy(save(tmp_path / "both", "act", facts=facts(**vectors)))
+    answers = {}
+    for tracker in ("sonic", "twist2", "falcon", ""):
+        policy.reset([11], ["boxing"])
+        answers[tracker] = policy.act(seen([11], [0], tracker=tracker)).actions
+    assert torch.equal(answers["falcon"], answers[""])
+    assert len({tuple(one.flatten().tolist()) for one in answers.values()}) == 3
+    assert policy.describe()["tracker_vector"] == ["sonic", "twist2"]
 
 
 def test_half_precision_computes_in_float32(tmp_path, checkpoints):

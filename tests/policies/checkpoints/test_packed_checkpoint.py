@@ -33,6 +33,7 @@ OURS = {
     "labels": "v4",
     "realign": 0.002,
     "task_vector": TASKS,
+    "tracker_vector": ("sonic", "twist2"),
     "tasks": TASKS,
     "trackers": ("twist2",),
 }
@@ -99,11 +100,11 @@ def test_lerobot_is_not_imported(packed):
 
 
 def test_a_task_vector_decides(packed):
-    """The task is an input: another one changes the answer."""
+    """Task and tracker are inputs: another one changes the answer."""
     policy = LearnedPolicy(packed)
     policy.card = dataclasses.replace(policy.card, tasks=TASKS)
-    answers = [policy.act(seen([5], [0], task=task)).actions for task in TASKS]
-    assert not torch.equal(*answers)
+    looks = [seen([5], [0], task=task, tracker=tracker) for task in TASKS for tracker in ("sonic", "twist2", "")]
+    assert len({tuple(policy.act(look).actions.flatten().tolist()) for look in looks}) == 6
 
 
 def test_one_task_needs_no_vector(tmp_path):
@@ -155,7 +156,7 @@ def test_the_number_of_cores_changes_nothing(packed):
         alone = follow(LearnedPolicy(packed), [4], 1)[4]
         torch.set_num_threads(3)
         assert torch.equal(follow(LearnedPolicy(packed), [4], 1)[4], alone)
-        assert torch.equal(follow(LearnedPolicy(packed), [*range(4, 9)], 1)[4], alone)  # five looks side by side
+        assert torch.equal(follow(LearnedPolicy(packed), [*range(4, 9)], 1)[4], alone)  # five queries side by side
         assert torch.get_num_threads() == 3
         with ThreadPoolExecutor(1) as later:
             assert later.submit(torch.get_num_threads).result() == 3
@@ -165,12 +166,12 @@ def test_the_number_of_cores_changes_nothing(packed):
 
 def test_worlds_that_cannot_be_served_get_an_error(packed):
     """A state that is not finite is its world's error; worlds that do not ask are left alone."""
-    policy, look = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
-    look.state[1, 7] = float("nan")
-    answer = policy.act(look)
+    policy, query = LearnedPolicy(packed), seen([1, 2, 3], [0, 0, 0], [True, True, False])
+    query.state[1, 7] = float("nan")
+    answer = policy.act(query)
     assert list(answer.errors) == [1] and "not finite" in answer.errors[1]
     assert torch.equal(answer.actions[0], policy.act(seen([1], [0])).actions[0])
-    blind = Observation(look.state, None, look.mask, "boxing", "boxing", "Strike.")
+    blind = Observation(query.state, None, query.mask, "boxing", "boxing", "Strike.")
     with pytest.raises(InputError, match=r"expected pictures of \[64, 64, 3\], was given none"):
         policy.act(blind)
 
@@ -240,7 +241,7 @@ def test_a_foreign_folder_is_not_overwritten(trained, tmp_path):
 
 @pytest.mark.parametrize("fault", ["disk", "folder"])
 def test_a_policy_that_cannot_be_replaced_is_kept(packed, tmp_path, monkeypatch, fault):
-    """Where the new files cannot be written, the packed policy that is there answers as before."""
+    """A packed policy that cannot be replaced answers as before."""
     folder = copy(packed, tmp_path)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -277,7 +278,7 @@ def test_a_policy_that_cannot_be_replaced_is_kept(packed, tmp_path, monkeypatch,
     ],
 )
 def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp_path, changes, said):
-    """Whatever our forward pass does not compute is one error that names file and field."""
+    """A setting that our forward pass does not compute is one error that names file and field."""
     folder = copy(packed, tmp_path)
     edit(folder / "config.json", **changes)
     with pytest.raises(InputError, match=said) as error:
@@ -295,7 +296,7 @@ def test_a_configuration_that_would_be_computed_otherwise_is_refused(packed, tmp
     ],
 )
 def test_processors_that_would_compute_otherwise_are_refused(packed, tmp_path, index, changes, said):
-    """What LeRobot's processors would do otherwise with the same files is one error that names file and step."""
+    """A step that LeRobot's processors would compute otherwise is one error that names file and step."""
     folder = copy(packed, tmp_path)
     path = folder / "policy_preprocessor.json"
     content = json.loads(path.read_text())
@@ -403,7 +404,7 @@ def test_damaged_files_are_one_error(packed, tmp_path):
     ],
 )
 def test_a_card_of_another_policy_is_refused(packed, tmp_path, field, value, said):
-    """What the card repeats of the files next to it is compared with them; the message names card and field."""
+    """Facts that the card repeats of the files next to it are compared with them; the message names card and field."""
     folder = copy(packed, tmp_path)
     edit(folder / CARD_FILE, **{field: value})
     with pytest.raises(InputError, match=f"card.json: {field} is {said}.*; take all files of one policy"):

@@ -37,7 +37,7 @@ TRACEBACK = (
 
 
 def facts(**other):
-    """What a server of ours declares."""
+    """Declaration of a server of ours."""
     names = tuple(action_names(other.get("labels", "v3.1")))
     said = {
         "policy": "noise 1",
@@ -102,7 +102,7 @@ def observation(worlds, mask=None, size=SIZE):
 
 
 class Recorder:
-    """What a server keeps of its life, and how it is told to fail."""
+    """Memory of a server, and the faults that it is told to have."""
 
     def __init__(self):
         self.lock, self.release = threading.Lock(), threading.Event()
@@ -113,8 +113,8 @@ class Recorder:
         with self.lock:
             self.seen.append((kind, content))
 
-    def fault(self, look):
-        return self.behave.get(float(look.state[0]), self.behave.get("any", ""))
+    def fault(self, query):
+        return self.behave.get(float(query.state[0]), self.behave.get("any", ""))
 
 
 class SocketServer(Recorder):
@@ -172,16 +172,16 @@ class SocketServer(Recorder):
                     socket.close(1011, "Internal server error.")
                     return
                 continue
-            self.note("look", request)
+            self.note("query", request)
             if not self.fail(socket, request):
                 seed = known.get(request.session) if request.seed is None else request.seed
                 rows = answer(request.state, request.image, seed, request.step)
                 socket.send(openpi_codec.pack_answer(rows, 1.0, roboarena=self.protocol == "roboarena"))
 
-    def fail(self, socket, look):
+    def fail(self, socket, query):
         """Fail as `behave` says; whether it did."""
-        kind = self.fault(look)
-        good = answer(look.state, look.image, 0, 0)
+        kind = self.fault(query)
+        good = answer(query.state, query.image, 0, 0)
         wrong = {
             "39": good[:, :39],
             "nan": np.where(np.arange(40) == 20, np.nan, good).astype(np.float32),
@@ -244,7 +244,7 @@ class SocketServer(Recorder):
                 continue
             if request.packed is not None:
                 request = dataclasses.replace(request, image=request.packed.unpacked(), packed=None)
-            self.note("look", request)
+            self.note("query", request)
             kind = self.fault(request)
             if kind == "text":
                 socket.send(vla_eval_codec.pack_error("RuntimeError: CUDA out of memory", message.seq, 0.0))
@@ -279,7 +279,7 @@ MODALITIES = {
     "action": {"delta_indices": list(range(CHUNK)), "modality_keys": list(ACTION)},
     "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
 }
-"""What a GR00T server that was trained on our data says of itself."""
+"""Declaration of a GR00T server that was trained on our data."""
 
 
 def npy(array):
@@ -416,7 +416,7 @@ class HttpServer(Recorder):
                     return
                 front = asked["observation"]["images"]["front"]
                 image = np.frombuffer(base64.b64decode(front["data_b64"]), np.uint8).reshape(front["shape"])
-                outer.note("look", image.shape)
+                outer.note("query", image.shape)
                 if outer.behave.get("any") == "unknown":
                     self.reply(409, {"error": "unknown episode"})
                     return

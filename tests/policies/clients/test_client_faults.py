@@ -75,9 +75,9 @@ def test_bad_answer_ends_one_world(running, kind, text):
 
 
 @pytest.mark.parametrize("running", ["vla-eval"], indirect=True)
-@pytest.mark.parametrize(("kind", "text"), [("late", "the answer to look"), ("hello", "type hello, expected action")])
+@pytest.mark.parametrize(("kind", "text"), [("late", "the answer to query"), ("hello", "type hello, expected action")])
 def test_answers_to_something_else(running, kind, text):
-    """An answer to another look than the last one is refused."""
+    """An answer to another query than the last one is refused."""
     policy = client(running)
     running.behave = {1.0: kind}
     chunk = policy.act(observation(3))
@@ -87,7 +87,7 @@ def test_answers_to_something_else(running, kind, text):
 
 @pytest.mark.parametrize("running", SOCKETS, indirect=True)
 def test_frames_that_nobody_asked_for(running):
-    """A second frame for one look is never taken for the answer to the next one."""
+    """A second frame for one query is never taken for the answer to the next one."""
     policy = client(running)
     running.behave = {1.0: "twice"}
     first = policy.act(observation(3))
@@ -120,7 +120,7 @@ def test_deadline(running):
 
 @pytest.mark.parametrize("running", [*SOCKETS, "gr00t"], indirect=True)
 def test_failed_reset_ends_its_world(running):
-    """An episode whose beginning fails is an error at its first look, and the next one is not."""
+    """An episode whose beginning fails is an error at its first query, and the next one is not."""
     policy = client(running)
     running.behave = {"reset": True}
     policy.reset([1, 2, 3], ["Isaac-Football"] * 3, np.array([False, True, False]))
@@ -178,7 +178,7 @@ def test_restarted_server(protocol):
 
 
 @pytest.mark.parametrize("protocol", SOCKETS)
-def test_restart_before_the_first_look(protocol):
+def test_restart_before_the_first_query(protocol):
     """An episode that has not received an action yet begins again on the new connection."""
     server = started(protocol)
     policy = client(server, retries=4, backoff=0.05)
@@ -203,7 +203,7 @@ def test_another_policy_after_a_restart():
 
 
 def test_a_server_that_greets_with_garbage_is_there():
-    """Whether somebody listens is no question of what he says: garbage is an answer, silence and a closed port none."""
+    """Garbage is an answer of a server that is there; silence and a closed port are none."""
     server = SocketServer("openpi", metadata=b"\xc1\xff")
     link = policies.get(f"remote:{server.url}")._connect()
     assert link.alive(10.0)
@@ -421,7 +421,7 @@ def test_close_breaks_off_what_waits(running):
 
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
-    while not any(kind in ("look", "get_action") for kind, _ in running.seen[-1:]):
+    while not any(kind in ("query", "get_action") for kind, _ in running.seen[-1:]):
         time.sleep(0.01)
     policy.close()
     asking.join(5.0)

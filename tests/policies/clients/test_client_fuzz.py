@@ -29,7 +29,7 @@ def broken(good, count, seed):
 
 
 def hand_made():
-    """What no random damage finds: other types in every place of an answer."""
+    """Damage that no random bytes find: other types in every place of an answer."""
     odd = [None, True, 7, -1.5, "text", b"bytes", [], {}, [[1.0] * 40], [[1] * 40, None], {"actions": 3}]
     odd += [np.zeros((0, 40)), np.zeros((40, 40, 40)), np.full((2, 40), np.inf), np.zeros((2, 40), bool)]
     odd += [np.zeros((3, 40), np.int64), np.zeros(40, np.float16), np.zeros((1, 0), np.float32)]
@@ -56,7 +56,7 @@ class Answering(SocketServer):
         self.replies = replies
         super().__init__(protocol, facts(needs_picture=False, picture=None))
 
-    def fail(self, socket, look):
+    def fail(self, socket, query):
         with self.lock:
             reply = self.replies.pop() if self.replies else None
         if reply is None:
@@ -64,8 +64,8 @@ class Answering(SocketServer):
         socket.send(reply)
         return True
 
-    def fault(self, look):
-        return "39"  # sends vla-eval's looks to `fail`, too
+    def fault(self, query):
+        return "39"  # sends vla-eval's queries to `fail`, too
 
 
 def drive(server, policy, count):

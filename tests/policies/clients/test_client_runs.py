@@ -69,14 +69,14 @@ def test_server_killed_in_mid_run(tmp_path, capsys, protocol):
     server = server_of(protocol)
     flags = [*SHORT, "--worlds", "3", "--remote-retries", "0", "--policy", f"remote:{server.url}"]
     assert main([*flags, "--out", str(tmp_path / "whole")], parts()) == 0
-    looks = sum(kind in ("look", "get_action") for kind, _ in server.seen)
+    queries = sum(kind in ("query", "get_action") for kind, _ in server.seen)
     count = [0]
     note = server.note
 
     def dying(kind, content):
         note(kind, content)
-        count[0] += kind in ("look", "get_action")
-        if count[0] == looks // 2:
+        count[0] += kind in ("query", "get_action")
+        if count[0] == queries // 2:
             server.behave = {"any": "dies"}
 
     server.note = dying
@@ -109,7 +109,7 @@ def test_another_server_under_the_same_address(tmp_path, capsys):
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "gr00t"])
 def test_server_that_declares_nothing_is_said_once(tmp_path, capsys, protocol):
-    """What is assumed is one line on stderr and part of the configuration; the number of worlds then counts."""
+    """An assumption is one line on stderr and part of the configuration; the number of worlds then counts."""
     server = Gr00tServer() if protocol == "gr00t" else SocketServer(protocol, metadata={})
     flags = [*SHORT, "--worlds", "2", "--policy", f"remote:{server.url}", "--out", str(tmp_path / "o")]
     assert main(flags, parts()) == 0

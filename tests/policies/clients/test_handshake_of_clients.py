@@ -1,4 +1,4 @@
-"""What servers declare is compared before the first episode; what they do not declare is tried, assumed and said."""
+"""Declarations of servers are compared before the first episode; absent ones are tried, assumed and said."""
 
 import copy
 import http.client
@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.policies.label_reader import V4Policy
 from arena_newton.policies.protocols.handshake import ServedPicture, read_facts
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.remote.address import DOORS, read_address
+from arena_newton.policies.remote.address import PREFIXES, read_address
 from arena_newton.policies.remote.gr00t_client import read_modalities
 from arena_newton.policies.remote.websocket import http_page
 
@@ -64,7 +64,7 @@ def test_what_differs_is_refused(protocol, other, text):
 
 @pytest.mark.parametrize("protocol", ["http", "openpi", "vla-eval", "gr00t"])
 def test_a_server_that_repeats_the_token(protocol, monkeypatch):
-    """What a server declares holds no token in results or messages, also where it repeats what it was sent."""
+    """Declarations hold no token in results or messages, also of a server that repeats what it was sent."""
     monkeypatch.setenv("ARENA_POLICY_TOKEN", "se-cret")
     server = server_of(protocol, facts(facts={"a": [{"b se-cret": "Bearer se-cret"}]}, policy="se-cret"))
     told = json.dumps(checked(server).describe())
@@ -155,13 +155,13 @@ def test_server_that_declares_nothing(protocol, capsys):
     policy.check()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "does not declare its label protocol (v3.1), action names" in lines[0]
-    look = next(content for kind, content in server.seen if kind == "look")
-    assert look.image.shape == (224, 224, 3) and (look.image == 127).all() and look.state[0] == 1.0
+    query = next(content for kind, content in server.seen if kind == "query")
+    assert query.image.shape == (224, 224, 3) and (query.image == 127).all() and query.state[0] == 1.0
     assert policy.depends_on_worlds
     said = policy.describe()
     assert said["assumed"]["picture"] == "224x224 pad" and said["assumed"]["rate"] == "50 Hz"
     if protocol == "openpi":  # nothing that its servers may not know is sent
-        assert look.seed is None and look.step is None and look.task == "" and look.session == ""
+        assert query.seed is None and query.step is None and query.task == "" and query.session == ""
     policy.reset([1, 2], ["Isaac-Football"] * 2)
     assert policy.act(observation(2, size=224)).errors == {} and capsys.readouterr().err == ""
     policy.close()
@@ -308,12 +308,12 @@ def test_gr00t_without_a_declaration(keys, capsys):
     server.close()
 
 
-@pytest.mark.parametrize("door", DOORS)
-def test_addresses(door):
+@pytest.mark.parametrize("prefix", PREFIXES)
+def test_addresses(prefix):
     """Every protocol has its name, its transport and a usual port."""
-    address = read_address(f"{door}://host/")
-    assert (address.protocol, address.transport, address.port) == DOORS[door] and address.host == "host"
-    assert read_address(f"{door}://[::1]:99").url.endswith("//[::1]:99")
+    address = read_address(f"{prefix}://host/")
+    assert (address.protocol, address.transport, address.port) == PREFIXES[prefix] and address.host == "host"
+    assert read_address(f"{prefix}://[::1]:99").url.endswith("//[::1]:99")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
-"""What docs/serving.md says of clients is so: protocols, ports, keys and limits."""
+"""Statements of docs/serving.md about clients hold: protocols, ports, keys and limits."""
 
 import re
 from pathlib import Path
 
 from arena_newton.policies.protocols import openpi_codec
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, expected_facts
-from arena_newton.policies.remote.address import DOORS, TOKEN_VARIABLE
+from arena_newton.policies.remote.address import PREFIXES, TOKEN_VARIABLE
 from arena_newton.policies.remote.client import MAX_FAILURES, MAX_REPLY
 from arena_newton.policies.remote.gr00t_client import Gr00tPolicy
 from arena_newton.policies.remote.openpi_client import ROBOARENA_IMAGE_KEY, OpenpiPolicy
@@ -26,11 +26,11 @@ def rows(title):
 def test_protocols_and_ports():
     """Every protocol is in the table, with its usual port and the extra that it needs."""
     named = {}
-    for doors, _, ports, _ in rows("`--policy remote:`"):
-        found = re.findall(r"`([\w+-]+)://", doors)
+    for addresses, _, ports, _ in rows("`--policy remote:`"):
+        found = re.findall(r"`([\w+-]+)://", addresses)
         named |= dict(zip(found, ports.split(", "), strict=True))
-    assert set(named) <= set(DOORS) and {door for door in DOORS if "+" not in door} <= set(named)
-    assert all(int(port) == DOORS[door][2] for door, port in named.items())
+    assert set(named) <= set(PREFIXES) and {prefix for prefix in PREFIXES if "+" not in prefix} <= set(named)
+    assert all(int(port) == PREFIXES[prefix][2] for prefix, port in named.items())
 
 
 def test_keys_and_limits():

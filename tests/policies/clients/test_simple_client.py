@@ -103,14 +103,14 @@ def test_what_is_asked_is_the_protocols(simple, capsys):
     server.seen.clear()
     policy.reset([3, 4], ["Isaac-Football"] * 2)
     seen = observation(2)
-    for look in range(2):
+    for query in range(2):
         chunk = policy.act(seen)
         assert not chunk.errors and chunk.actions.shape == (2, 5, 40)
         for world in range(2):
             wanted = rows(np.asarray(seen.state)[world]).astype(np.float32)
             assert np.allclose(chunk.actions[world], wanted, atol=1e-6)
-        asked = [request for path, request in server.seen[2 * look :] if path == "/act"]
-        assert len(asked) == 2 and all(one["history"] == ({} if look else {"reset": True}) for one in asked)
+        asked = [request for path, request in server.seen[2 * query :] if path == "/act"]
+        assert len(asked) == 2 and all(one["history"] == ({} if query else {"reset": True}) for one in asked)
     names = ["image", "instruction", "history", "state", "condition", "gt_action", "dataset_name", "timestamp"]
     assert list(asked[0]) == names and list(asked[0]["image"]) == ["rgb_head_stereo_left"]
     picture, numbers = asked[0]["image"]["rgb_head_stereo_left"], asked[0]["state"]["states"]

@@ -12,16 +12,16 @@ from websockets.sync.client import connect
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy, world_mask
-from arena_newton.policies.protocols.policy_messages import Look
-from arena_newton.policies.serve.door_guard import DoorGuard
+from arena_newton.policies.protocols.policy_messages import Query
+from arena_newton.policies.serve.connection_guard import ConnectionGuard
 from arena_newton.policies.serve.policy_server import PolicyServer
-from arena_newton.policies.serve.serve_command import open_door
+from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION
 
 
 class Remembers(Policy):
-    """Its answer holds noise of the episode's seed, the number of looks so far, their sum, and what is seen now."""
+    """Its answer holds noise of the episode's seed, the number of queries so far, their sum, and what is seen now."""
 
     name, labels, chunk_size = "remembers", "v3.1", 4
 
@@ -29,13 +29,13 @@ class Remembers(Policy):
         self.needs_image, self.pause = sees, pause
         self.camera = CameraConfig(width=32, height=32) if sees else None
         self.calls, self.inside, self.most_inside = [], 0, 0
-        self.looks = np.zeros(0)
+        self.queries = np.zeros(0)
 
     def reset(self, seeds, tasks, mask=None):
-        if len(self.looks) != len(seeds):
-            self.looks, self.sums, self.seeds = np.zeros(len(seeds)), np.zeros(len(seeds)), np.zeros(len(seeds), int)
+        if len(self.queries) != len(seeds):
+            self.queries, self.sums, self.seeds = np.zeros(len(seeds)), np.zeros(len(seeds)), np.zeros(len(seeds), int)
         chosen = world_mask(mask, len(seeds))
-        self.looks[chosen], self.sums[chosen] = 0, 0
+        self.queries[chosen], self.sums[chosen] = 0, 0
         self.seeds[chosen] = np.asarray(seeds)[chosen]
 
     def act(self, observation):
@@ -43,14 +43,15 @@ class Remembers(Policy):
         self.most_inside = max(self.inside, self.most_inside)
         rows = np.flatnonzero(observation.mask)
         self.calls.append((len(rows), observation.task, observation.instruction))
+        self.tracker = observation.tracker
         time.sleep(self.pause)
-        self.looks[rows] += 1
+        self.queries[rows] += 1
         self.sums[rows] += observation.state[rows, 6].numpy()
-        actions = np.tile(STAND_ACTION, (len(self.looks), self.chunk_size, 1))
+        actions = np.tile(STAND_ACTION, (len(self.queries), self.chunk_size, 1))
         for row in rows:
-            noise = np.random.default_rng([self.seeds[row], int(self.looks[row])]).standard_normal(self.chunk_size)
+            noise = np.random.default_rng([self.seeds[row], int(self.queries[row])]).standard_normal(self.chunk_size)
             actions[row, :, 9] = 0.01 * noise
-            actions[row, :, 10], actions[row, :, 11] = 0.001 * self.looks[row], 0.001 * self.sums[row]
+            actions[row, :, 10], actions[row, :, 11] = 0.001 * self.queries[row], 0.001 * self.sums[row]
             if observation.image is not None:
                 actions[row, :, 12] = 0.001 * observation.image[row].float().mean()
         self.inside -= 1
@@ -98,22 +99,22 @@ def state(first=0.0, kind=0):
     return numbers
 
 
-def look(first=0.0, *, kind=0, image=None, **more):
+def query(first=0.0, *, kind=0, image=None, **more):
     """A look at such a state."""
-    return Look(state(first, kind), image, **({"task": "boxing", "instruction": "Box."} | more))
+    return Query(state(first, kind), image, **({"task": "boxing", "instruction": "Box."} | more))
 
 
 class Served:
     """A policy behind a protocol at a free port."""
 
     def __init__(self, policy, protocol="openpi", token="", connections=None, tls=None, raw=False, **options):
-        options = {"max_sessions": 8, "max_wait": 0.05} | options
+        options = {"max_sessions": 8, "max_wait": 0.002} | options
         self.policy = policy
         self.server = PolicyServer(policy, **options)
         self.server.start()
-        guard = DoorGuard(connections or self.server.max_sessions, token, local=True)
-        self.door = open_door(self.server, ServeOptions(policy="x", protocol=protocol, port=0), guard, tls)
-        self.port = self.door.port
+        guard = ConnectionGuard(connections or self.server.max_sessions, token, local=True)
+        self.endpoint = open_endpoint(self.server, ServeOptions(policy="x", protocol=protocol, port=0), guard, tls)
+        self.port = self.endpoint.port
         policy.calls = []
 
     def socket(self, **more):
@@ -132,13 +133,13 @@ class Served:
         return reply.status, json.loads(data) if data[:1] == b"{" else data
 
     def close(self):
-        """End door and server."""
-        self.door.close()
+        """End endpoint and server."""
+        self.endpoint.close()
         self.server.close()
 
 
 def together(*works):
-    """What several functions return that run at the same time."""
+    """Results of several functions that run at the same time."""
     results = [None] * len(works)
 
     def run(index):

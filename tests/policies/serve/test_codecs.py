@@ -13,7 +13,7 @@ import msgpack
 import numpy as np
 import pytest
 from PIL import Image
-from served_policies import look, state
+from served_policies import query, state
 
 from arena_newton.errors import InputError
 from arena_newton.policies.protocols import arena_codec, openpi_codec, vla_eval_codec
@@ -33,7 +33,7 @@ from arena_newton.policies.protocols.packed_arrays import (
     pack,
     unpack,
 )
-from arena_newton.policies.protocols.policy_messages import Begin, End, Look
+from arena_newton.policies.protocols.policy_messages import Begin, End, Query
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.robot.canonical import STATE_WIDTH
@@ -88,7 +88,7 @@ def test_golden_openpi():
     request, roboarena = openpi_codec.unpack_request(bytes.fromhex(OPENPI_REQUEST))
     assert not roboarena and np.array_equal(request.state, state()) and request.instruction == "Box."
     assert request.image is None and request.seed is None and request.step is None and request.session == ""
-    written = openpi_codec.pack_request(Look(state(), instruction="Box."), extras=False)
+    written = openpi_codec.pack_request(Query(state(), instruction="Box."), extras=False)
     assert written.hex() == OPENPI_REQUEST
     assert np.array_equal(openpi_codec.unpack_answer(bytes.fromhex(OPENPI_ANSWER), "server"), ACTION)
     assert openpi_codec.pack_answer(ACTION, 1.5).hex() == OPENPI_ANSWER
@@ -123,7 +123,7 @@ def test_golden_vla_eval():
     assert vla_eval_codec.pack_error("no", 3, 2.5).hex() == VLA_ERROR
     with pytest.raises(WireError, match="^server: the server says no$"):
         vla_eval_codec.unpack_action(vla_eval_codec.unpack_message(bytes.fromhex(VLA_ERROR)), 3, "server")
-    with pytest.raises(WireError, match="answer to look 3, expected that to 4"):
+    with pytest.raises(WireError, match="answer to query 3, expected that to 4"):
         vla_eval_codec.unpack_action(action, 4, "server")
 
 
@@ -133,7 +133,7 @@ def test_golden_arena():
     front = {"shape": [16, 16, 3], "dtype": "uint8", "data_b64": base64.b64encode(pixels).decode()}
     body = {"observation": {"images": {"front": front}, "state": [float(v) for v in state()]}}
     body |= {"robot_type": "unitree_g1_refpose_v3_1", "return_chunk": True, "task": "Isaac-Move-Boxing"}
-    seen, chunk = arena_codec.unpack_look(json.dumps(body).encode())
+    seen, chunk = arena_codec.unpack_query(json.dumps(body).encode())
     assert chunk and seen.task == "Isaac-Move-Boxing" and seen.session == "" and seen.seed is None
     assert seen.image.tobytes() == pixels and np.array_equal(seen.state, state())
     reply = json.loads(arena_codec.pack_chunk(ACTION))
@@ -146,7 +146,7 @@ def test_golden_arena():
 def test_records_come_back():
     """Every record is the same after each codec, pictures to the bit (PNG is lossless)."""
     image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    seen = look(0.3, image=image, session="3", seed=2**31 - 1, step=40)
+    seen = query(0.3, image=image, session="3", seed=2**31 - 1, step=40)
 
     def same(got):
         assert np.array_equal(got.image if got.packed is None else got.packed.unpacked(), image) and np.array_equal(
@@ -159,7 +159,7 @@ def test_records_come_back():
     for images in ("png", "raw"):
         frame = vla_eval_codec.pack_request(seen, 1, 0.0, images)
         same(vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame)))
-    same(arena_codec.unpack_look(arena_codec.pack_look(seen))[0])
+    same(arena_codec.unpack_query(arena_codec.pack_query(seen))[0])
     begin = Begin("3", 5, "boxing", "Box.")
     assert openpi_codec.unpack_request(openpi_codec.pack_request(begin, roboarena=True))[0] == begin
     for request in (begin, End("3", {"session": "3"})):
@@ -302,7 +302,7 @@ def _openpi(**more):
 
 def _arena(**more):
     body = {"observation": {"state": [0.0] * 64}} | more
-    return lambda: arena_codec.unpack_look(json.dumps(body).encode())
+    return lambda: arena_codec.unpack_query(json.dumps(body).encode())
 
 
 def _front(**more):
@@ -326,10 +326,10 @@ def _front(**more):
         (_openpi(seed=True), "seed is 'True'"),
         (_openpi(prompt=3), "prompt is not a text"),
         (lambda: vla_eval_codec.unpack_message(b"\x81\xa4type\xa5hello"), "without payload seq timestamp"),
-        (lambda: arena_codec.unpack_look(b"{"), "not JSON"),
-        (lambda: arena_codec.unpack_look(b"[" * 60_000), "not JSON"),
-        (lambda: arena_codec.unpack_look(b"[]"), "the body is a list"),
-        (lambda: arena_codec.unpack_look(b'{"observation": {"state": [NaN]}}'), "not JSON"),
+        (lambda: arena_codec.unpack_query(b"{"), "not JSON"),
+        (lambda: arena_codec.unpack_query(b"[" * 60_000), "not JSON"),
+        (lambda: arena_codec.unpack_query(b"[]"), "the body is a list"),
+        (lambda: arena_codec.unpack_query(b'{"observation": {"state": [NaN]}}'), "not JSON"),
         (_arena(observation=1), "observation is int"),
         (_arena(observation={"state": [0.0] * 63 + [True]}), "not a number"),
         (_arena(observation={"state": [[0.0], [1.0, 2.0]]}), "rows of different length"),
@@ -344,21 +344,21 @@ def _front(**more):
     ],
 )
 def test_unfit_requests(work, message):
-    """What is wrong with a request is named, in one line."""
+    """An unfit request is one line that names the fault."""
     with pytest.raises(WireError, match=message) as caught:
         work()
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
 
 
 def test_a_traceback_is_one_line():
-    """What another server sends as text is shown as its last line, cleared of control characters."""
+    """Text of another server is shown as its last line, cleared of control characters."""
     text = "Traceback (most recent call last):\n  File x\nKeyError: \x1b[31m'observation/joint_position'\n"
     with pytest.raises(WireError, match="^server: the server says KeyError: 'observation/joint_position'$"):
         openpi_codec.unpack_answer(text, "server")
 
 
 def test_handshake_comes_back():
-    """What is declared is the same behind every protocol, also where little is."""
+    """Declared facts are the same behind every protocol, also where they are few."""
     few = ServedFacts(picture=ServedPicture(64, 48, "native"), chunk_length=20, realign=0.002, facts={"family": "act"})
     for facts in (expected_facts("v4"), ServedFacts(), few):
         assert openpi_codec.unpack_metadata(openpi_codec.pack_metadata(facts), "s")[0] == facts

@@ -1,10 +1,10 @@
-"""The server object: whom a look belongs to, what is answered together, and what a session's memory is."""
+"""The server object: whom a query belongs to, what is answered together, and what a session's memory is."""
 
 import time
 
 import numpy as np
 import pytest
-from served_policies import Fails, Remembers, TurnsV4, look, state, together
+from served_policies import Fails, Remembers, TurnsV4, query, state, together
 
 from arena_newton.data.readers.label_protocols import decode_v4
 from arena_newton.errors import InputError
@@ -12,7 +12,7 @@ from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.protocols.picture_fit import fitted_picture
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve.policy_server import PolicyServer, Refused
 
@@ -23,7 +23,7 @@ def made():
     servers = []
 
     def make(policy, **options):
-        servers.append(PolicyServer(policy, **({"max_sessions": 6, "max_wait": 0.05} | options)))
+        servers.append(PolicyServer(policy, **({"max_sessions": 6, "max_wait": 0.002} | options)))
         servers[-1].start()
         policy.calls = []
         return servers[-1]
@@ -36,18 +36,18 @@ def made():
 def episode(server, owner, seed, values, step=4):
     """The chunks of an episode that sees `values` one after the other."""
     server.begin(owner, Begin("", seed, "boxing"))
-    return [server.look(owner, look(v, seed=seed, step=step * i)).actions for i, v in enumerate(values)]
+    return [server.query(owner, query(v, seed=seed, step=step * i)).actions for i, v in enumerate(values)]
 
 
-def test_looks_that_come_together_are_one_call(made):
-    """Looks within max_wait are answered by one call of the policy, no more than max_batch_size at once."""
-    server = made(Remembers(), max_batch_size=4, max_wait=0.5)
+def test_queries_that_come_together_are_one_call(made):
+    """Queries within max_wait are answered by one call of the policy, no more than max_batch_size at once."""
+    server = made(Remembers(), max_batch_size=4, max_wait=0.5, tracker="sonic")
     for n in range(6):
         server.begin(str(n), Begin("", n, "boxing"))
-    answers = together(*[lambda n=n: server.look(str(n), look(n, seed=n, step=0)) for n in range(6)])
+    answers = together(*[lambda n=n: server.query(str(n), query(n, seed=n, step=0)) for n in range(6)])
     assert all(answer.actions.shape == (4, 40) for answer in answers)
     assert sorted(size for size, *_ in server.policy.calls) == [2, 4]
-    assert server.counts.batches == {4: 1, 2: 1} and server.counts.looks == 6
+    assert server.counts.batches == {4: 1, 2: 1} and server.counts.queries == 6 and server.policy.tracker == "sonic"
 
 
 def test_nobody_waits_for_sessions_that_ask_already(made):
@@ -56,7 +56,7 @@ def test_nobody_waits_for_sessions_that_ask_already(made):
     for n in range(2):
         server.begin(str(n), Begin("", n, "boxing"))
     began = time.monotonic()
-    together(*[lambda n=n: server.look(str(n), look(n, seed=n, step=0)) for n in range(2)])
+    together(*[lambda n=n: server.query(str(n), query(n, seed=n, step=0)) for n in range(2)])
     assert time.monotonic() - began < 2.5
     assert server.counts.batches == {2: 1}
 
@@ -80,58 +80,58 @@ def test_begin_clears_the_memory_of_its_session_alone(made):
     first = episode(server, "a", 1, [0.1, 0.2])
     other = episode(server, "b", 2, [0.3])
     assert np.array_equal(episode(server, "a", 1, [0.1, 0.2]), first)
-    assert not np.array_equal(server.look("b", look(0.3, seed=2, step=4)).actions, other[0])
+    assert not np.array_equal(server.query("b", query(0.3, seed=2, step=4)).actions, other[0])
 
 
-def test_the_same_look_again_is_not_a_new_one(made):
-    """A look that is sent twice (its reply was lost) has the same answer and leaves the memory as it was."""
+def test_the_same_query_again_is_not_a_new_one(made):
+    """A query that is sent twice (its reply was lost) has the same answer and leaves the memory as it was."""
     server = made(Remembers())
     chunks = episode(server, "a", 1, [0.1, 0.2])
-    again = server.look("a", look(0.2, seed=1, step=4)).actions
+    again = server.query("a", query(0.2, seed=1, step=4)).actions
     assert np.array_equal(again, chunks[1]) and server.counts.repeated == 1
-    third = server.look("a", look(0.3, seed=1, step=8)).actions
+    third = server.query("a", query(0.3, seed=1, step=8)).actions
     assert np.array_equal(third, episode(made(Remembers()), "a", 1, [0.1, 0.2, 0.3])[2])
 
 
-def test_another_look_at_the_same_step_is_a_new_one(made):
-    """What was answered is remembered for the same content only."""
+def test_another_query_at_the_same_step_is_a_new_one(made):
+    """An answer is remembered for the same content only."""
     server = made(Remembers())
     chunks = episode(server, "a", 1, [0.1, 0.2])
-    assert not np.array_equal(server.look("a", look(0.7, seed=1, step=4)).actions, chunks[1])
-    assert server.counts.repeated == 0 and server.counts.looks == 3
+    assert not np.array_equal(server.query("a", query(0.7, seed=1, step=4)).actions, chunks[1])
+    assert server.counts.repeated == 0 and server.counts.queries == 3
 
 
 def test_a_session_is_in_a_batch_once(made):
-    """Looks of one session that come at the same time are answered one after the other, each from its own content."""
+    """Queries of one session that come at the same time are answered one after the other, each from its own content."""
     server = made(Remembers(), max_wait=0.3)
     for owner in ("a", "b"):  # while b asks nothing, the batch of a is open
         server.begin(owner, Begin("", 1, "boxing"))
     first, second = together(
-        lambda: server.look("a", look(0.1)).actions,
-        lambda: (time.sleep(0.1), server.look("a", look(0.2)).actions)[1],
+        lambda: server.query("a", query(0.1)).actions,
+        lambda: (time.sleep(0.1), server.query("a", query(0.2)).actions)[1],
     )
     assert np.array_equal([first, second], episode(made(Remembers()), "a", 1, [0.1, 0.2]))
     assert server.counts.batches == {1: 2}
 
 
 def test_step_zero_begins_an_episode(made):
-    """A look of step 0 begins an episode where none was announced, with its seed, and again after others."""
+    """A query of step 0 begins an episode where none was announced, with its seed, and again after others."""
     server = made(Remembers())
-    first = [server.look("a", look(v, seed=5, step=s)).actions for v, s in ((0.1, 0), (0.2, 4))]
+    first = [server.query("a", query(v, seed=5, step=s)).actions for v, s in ((0.1, 0), (0.2, 4))]
     assert np.array_equal(first, episode(made(Remembers()), "a", 5, [0.1, 0.2]))
-    assert np.array_equal(server.look("a", look(0.1, seed=5, step=0)).actions, first[0])
+    assert np.array_equal(server.query("a", query(0.1, seed=5, step=0)).actions, first[0])
     assert server.counts.episodes == 2
 
 
 def test_an_episode_that_is_not_known_is_refused(made):
-    """A look in the middle of an episode whose memory is gone is refused, not continued without it."""
+    """A query in the middle of an episode whose memory is gone is refused, not continued without it."""
     server = made(Remembers())
     with pytest.raises(Refused, match="20 actions into an episode that the server does not know") as caught:
-        server.look("a", look(0.1, seed=5, step=20))
+        server.query("a", query(0.1, seed=5, step=20))
     assert caught.value.reason == "unknown_episode"
     server.begin("a", Begin("", 5, "boxing"))
     with pytest.raises(Refused, match="seed 6, the session's episode of seed 5"):
-        server.look("a", look(0.1, seed=6, step=4))
+        server.query("a", query(0.1, seed=6, step=4))
 
 
 def test_an_episode_of_another_client_is_not_continued(made):
@@ -140,17 +140,17 @@ def test_an_episode_of_another_client_is_not_continued(made):
     for seed_of in ("first", "second"):
         server.begin("a", Begin("", 5, "boxing"))
         if seed_of == "first":
-            assert len(server.look("a", look(0.1, seed=5, step=0)).actions) == 4
+            assert len(server.query("a", query(0.1, seed=5, step=0)).actions) == 4
     for step in (4, 8):
         with pytest.raises(Refused, match=f"{step} actions into an episode that the server does not know"):
-            server.look("a", look(0.2, seed=5, step=step))
-    server.look("a", look(0.3, seed=5, step=0))
+            server.query("a", query(0.2, seed=5, step=step))
+    server.query("a", query(0.3, seed=5, step=0))
     with pytest.raises(Refused, match="5 actions into an episode") as caught:
-        server.look("a", look(0.2, seed=5, step=5))
+        server.query("a", query(0.2, seed=5, step=5))
     assert caught.value.reason == "unknown_episode"
-    server.look("a", look(0.2, seed=5, step=3))  # it may execute fewer than it was given
+    server.query("a", query(0.2, seed=5, step=3))  # it may execute fewer than it was given
     with pytest.raises(Refused, match="2 actions into an episode"):
-        server.look("a", look(0.2, seed=5, step=2))
+        server.query("a", query(0.2, seed=5, step=2))
 
 
 def test_a_connection_of_many_episodes_keeps_no_rows(made, monkeypatch):
@@ -158,20 +158,20 @@ def test_a_connection_of_many_episodes_keeps_no_rows(made, monkeypatch):
     monkeypatch.setattr("arena_newton.policies.serve.policy_server.IDLE", 0.05)
     server = made(Remembers(), max_sessions=2)
     for number in range(5):
-        assert server.look("a", look(session=str(number))).actions.shape == (4, 40)
+        assert server.query("a", query(session=str(number))).actions.shape == (4, 40)
         time.sleep(0.06)
     with pytest.raises(Refused, match="all 2 sessions are in use"):
-        server.look("b", look())
+        server.query("b", query())
 
 
-def test_another_sentence_is_another_look(made):
+def test_another_sentence_is_another_query(made):
     """The answer to one instruction is not that to another, which only looks the same."""
     server = made(Remembers())
-    first = server.look("a", look(0.1, seed=1, step=0, instruction="Box.")).actions
-    assert np.array_equal(server.look("a", look(0.1, seed=1, step=0, instruction="Box.")).actions, first)
+    first = server.query("a", query(0.1, seed=1, step=0, instruction="Box.")).actions
+    assert np.array_equal(server.query("a", query(0.1, seed=1, step=0, instruction="Box.")).actions, first)
     assert server.counts.repeated == 1
-    second = server.look("a", look(0.1, seed=1, step=3, instruction="Box."))
-    third = server.look("a", look(0.1, seed=1, step=3, instruction="Stop."))
+    second = server.query("a", query(0.1, seed=1, step=3, instruction="Box."))
+    third = server.query("a", query(0.1, seed=1, step=3, instruction="Stop."))
     assert server.counts.repeated == 1 and not np.array_equal(second.actions, third.actions)
 
 
@@ -194,7 +194,7 @@ def test_tasks_are_asked_one_by_one(made):
     asks = [("boxing", "Box."), ("Isaac-Move-Boxing-Bag-G129-Dex3-Wholebody", "Box."), ("football", ""), ("", "Hop.")]
     for n in range(4):
         server.begin(str(n), Begin("", n, asks[n][0], asks[n][1]))
-    together(*[lambda n=n: server.look(str(n), look(n, task=asks[n][0], instruction=asks[n][1])) for n in range(4)])
+    together(*[lambda n=n: server.query(str(n), query(n, task=asks[n][0], instruction=asks[n][1])) for n in range(4)])
     told = sorted((size, task) for size, task, _ in server.policy.calls)
     assert told == [(1, ""), (1, "football"), (2, "boxing")]
     assert [text for _, task, text in server.policy.calls if task == "football"][0].startswith("Kick")
@@ -206,26 +206,26 @@ def test_a_policy_fails_for_those_who_asked(made, capsys):
     for owner in "abcd":
         server.begin(owner, Begin("", 1, "boxing"))
     with pytest.raises(Refused, match=r"^the policy failed \(RuntimeError\); the server's console says more$"):
-        server.look("a", look(kind=1, step=0))
+        server.query("a", query(kind=1, step=0))
     assert "a secret of the server" in capsys.readouterr().err
     with pytest.raises(Refused, match="does not know"):
-        server.look("a", look(step=8))
+        server.query("a", query(step=8))
     with pytest.raises(Refused, match=r"joint_pos\[left_shoulder_pitch_joint\] \(index 20\) is nan") as caught:
-        server.look("b", look(kind=2, step=0))
+        server.query("b", query(kind=2, step=0))
     assert caught.value.reason == "policy"
     with pytest.raises(Refused, match="no plan for this world"):
-        server.look("c", look(kind=3, step=0))
+        server.query("c", query(kind=3, step=0))
     with pytest.raises(Refused, match="does not know sit_sofa") as caught:
         server.begin("d", Begin("", 1, "sit_sofa"))
     assert caught.value.reason == "unfit"
-    assert server.look("d", look(step=0)).actions.shape == (4, 40)
+    assert server.query("d", query(step=0)).actions.shape == (4, 40)
 
 
 def test_another_robot_is_refused(made):
-    """A look that says it executes another label protocol is refused with both names."""
+    """A query that says it executes another label protocol is refused with both names."""
     server = made(Remembers())
     with pytest.raises(Refused, match="'unitree_g1_gmt_cmd_v4', the policy's actions are for 'unitree_g1_refpose_v3_"):
-        server.look("a", look(robot_type="unitree_g1_gmt_cmd_v4"))
+        server.query("a", query(robot_type="unitree_g1_gmt_cmd_v4"))
 
 
 def test_v4_is_decoded_by_session(made):
@@ -238,8 +238,8 @@ def test_v4_is_decoded_by_session(made):
     for owner in ("a", "b"):
         server.begin(owner, Begin("", 1, "boxing"))
     for i in range(3):
-        assert np.array_equal(server.look("a", look(0.1 * i, step=5 * i)).actions, expected[i])
-    assert np.array_equal(server.look("b", look(step=0)).actions, expected[0])
+        assert np.array_equal(server.query("a", query(0.1 * i, step=5 * i)).actions, expected[i])
+    assert np.array_equal(server.query("b", query(step=0)).actions, expected[0])
     facts = made(TurnsV4()).facts
     assert facts.labels == "v4" and facts.action_names[5] == "action.root_yaw_rate" and facts.realign == 0.0
 
@@ -275,16 +275,16 @@ def test_pictures_are_fitted(made):
     with pytest.raises(WireError, match="64x48 cannot be made 32x32"):
         fitted_picture(native, CameraConfig(width=32, height=32, fit="native"))
     server = made(Remembers(sees=True))
-    answer = server.look("a", Look(state(), native, "boxing", seed=1, step=0)).actions
+    answer = server.query("a", Query(state(), native, "boxing", seed=1, step=0)).actions
     assert answer[0, 12] == pytest.approx(0.001 * padded.mean(), rel=1e-4)
     with pytest.raises(Refused, match="looks at pictures, the message holds none"):
-        server.look("a", look(step=4))
+        server.query("a", query(step=4))
 
 
 def test_a_closed_server_refuses(made):
-    """Who waits when the server closes, and who comes later, is told so."""
+    """A session that waits when the server closes, and one that comes later, is told so."""
     server = made(Remembers(pause=0.2))
-    waiting = together(lambda: server.look("a", look(seed=1, step=0)), lambda: (time.sleep(0.05), server.close())[0])
+    waiting = together(lambda: server.query("a", query(seed=1, step=0)), lambda: (time.sleep(0.05), server.close())[0])
     with pytest.raises(Refused, match="closing"):
-        server.look("b", look(step=0))
+        server.query("b", query(step=0))
     assert waiting[0].actions.shape == (4, 40) or isinstance(waiting[0], Refused)

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 import torch
-from served_policies import Remembers, TurnsV4, look, state
+from served_policies import Remembers, TurnsV4, query, state
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
@@ -66,7 +66,7 @@ def test_bad_flags(capsys, flags, message):
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
 
 
-def test_the_first_look_is_of_a_task_that_the_policy_does():
+def test_the_first_query_is_of_a_task_that_the_policy_does():
     """Nobody has to name a task: Boxing where the policy does not say which it does, otherwise one of its own."""
 
     class Sofas(Remembers):
@@ -123,7 +123,7 @@ def test_the_command_serves_until_it_is_interrupted(stop, protocol):
             with connect(f"ws://127.0.0.1:{port}") as client:
                 client.recv(timeout=10)
                 for step in (0, 50):
-                    client.send(openpi_codec.pack_request(look(seed=1, step=step)))
+                    client.send(openpi_codec.pack_request(query(seed=1, step=step)))
                     chunk = openpi_codec.unpack_answer(client.recv(timeout=10), "server")
                     assert np.array_equal(chunk, np.tile(STAND_ACTION, (50, 1)))
         process.send_signal(stop)
@@ -133,9 +133,9 @@ def test_the_command_serves_until_it_is_interrupted(stop, protocol):
     loading = [line for line in errors.splitlines() if line.startswith("loading ")]
     assert process.returncode == 0 and errors.splitlines() == loading
     if protocol == "openpi":
-        assert "1 episodes, 2 looks answered" in out and "batch sizes 1: 2" in out
+        assert "1 episodes, 2 queries answered" in out and "batch sizes 1: 2" in out
     else:
-        assert "0 episodes, 0 looks answered" in out
+        assert "0 episodes, 0 queries answered" in out
 
 
 def test_labels_of_what_is_served(monkeypatch):
@@ -185,11 +185,11 @@ def observation(policy, values, mask):
     return Observation(torch.from_numpy(states), image, np.array(mask), "boxing", "Isaac-Move-Boxing", "Box.")
 
 
-def play(policy, seeds, looks=4):
+def play(policy, seeds, queries=4):
     """Chunks of several worlds that ask at different times."""
     policy.reset(seeds, ["Isaac-Move-Boxing"] * len(seeds))
     chunks = []
-    for number in range(looks):
+    for number in range(queries):
         mask = [True] * len(seeds) if number % 2 == 0 else [w % 2 == 0 for w in range(len(seeds))]
         seen = observation(policy, [0.01 * number + 0.1 * w for w in range(len(seeds))], mask)
         answer = policy.act(seen)

@@ -5,7 +5,7 @@ import random
 
 import numpy as np
 import pytest
-from served_policies import Remembers, look
+from served_policies import Remembers, query
 from websockets.exceptions import ConnectionClosed
 
 from arena_newton.policies.protocols import arena_codec, openpi_codec, vla_eval_codec
@@ -17,7 +17,7 @@ from tests.fuzz.mutants import damaged
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
-LOOK = look(0.1, image=IMAGE, session="1", seed=3, step=0)
+QUERY = query(0.1, image=IMAGE, session="1", seed=3, step=0)
 BEGIN = Begin("1", 3, "boxing", "Box.")
 ACTIONS = np.zeros((2, 40), dtype=np.float32)
 
@@ -38,7 +38,7 @@ def read_answer(data):
 
 
 FRAMES = {
-    "openpi request": (openpi_codec.pack_request(LOOK, roboarena=True), openpi_codec.unpack_request, False),
+    "openpi request": (openpi_codec.pack_request(QUERY, roboarena=True), openpi_codec.unpack_request, False),
     "openpi reset": (openpi_codec.pack_request(BEGIN, roboarena=True), openpi_codec.unpack_request, False),
     "openpi metadata": (
         openpi_codec.pack_metadata(expected_facts()),
@@ -50,12 +50,12 @@ FRAMES = {
         lambda data: openpi_codec.unpack_answer(data, "x"),
         False,
     ),
-    "vla look": (vla_eval_codec.pack_request(LOOK, 1, 0.0), read_vla, False),
+    "vla query": (vla_eval_codec.pack_request(QUERY, 1, 0.0), read_vla, False),
     "vla start": (vla_eval_codec.pack_request(BEGIN, 1, 0.0), read_vla, False),
     "vla end": (vla_eval_codec.pack_request(End("1"), 1, 0.0), read_vla, False),
     "vla hello": (vla_eval_codec.pack_hello(expected_facts(), 1, 0.0), read_vla, False),
     "vla action": (vla_eval_codec.pack_action(ACTIONS, 1, 0.0), read_vla, False),
-    "arena look": (arena_codec.pack_look(LOOK), arena_codec.unpack_look, True),
+    "arena query": (arena_codec.pack_query(QUERY), arena_codec.unpack_query, True),
     "arena begin": (arena_codec.pack_begin(BEGIN), arena_codec.unpack_begin, True),
     "arena chunk": (arena_codec.pack_chunk(ACTIONS), lambda data: arena_codec.unpack_chunk(data, "x"), True),
     "arena config": (
@@ -117,12 +117,12 @@ def test_sockets_survive_damaged_frames(served, protocol, mutants):
     with one.socket() as sane:
         if protocol == "openpi":
             sane.recv(timeout=10)
-            sane.send(openpi_codec.pack_request(LOOK))
+            sane.send(openpi_codec.pack_request(QUERY))
             assert openpi_codec.unpack_answer(sane.recv(timeout=10), "x").shape == (4, 40)
         else:
             sane.send(vla_eval_codec.pack_hello(None, 1, 0.0))
             sane.recv(timeout=10)
-            sane.send(vla_eval_codec.pack_request(LOOK, 5, 0.0))
+            sane.send(vla_eval_codec.pack_request(QUERY, 5, 0.0))
             message = vla_eval_codec.unpack_message(sane.recv(timeout=10))
             assert vla_eval_codec.unpack_action(message, 5, "x").shape == (4, 40)
     if client is not None:
@@ -145,7 +145,7 @@ def test_http_survives_damaged_bodies(served, mutants):
     """Damaged bodies and heads are answered with a status and one line of JSON, or hung up on; the server goes on."""
     one = served(Remembers(sees=True), "arena", max_wait=0.0)
     rng = random.Random("arena")
-    bodies = {"/infer": arena_codec.pack_look(LOOK), "/reset": arena_codec.pack_begin(BEGIN)}
+    bodies = {"/infer": arena_codec.pack_query(QUERY), "/reset": arena_codec.pack_begin(BEGIN)}
     statuses = set()
     connection = http.client.HTTPConnection("127.0.0.1", one.port, timeout=10)
     for _ in range(mutants):
@@ -157,5 +157,5 @@ def test_http_survives_damaged_bodies(served, mutants):
         assert data[:1] == b"{" and b"Traceback" not in data and b"\\n" not in data
     connection.close()
     assert {200, 400} <= statuses <= {200, 400, 409}
-    reply = one.http("POST", "/infer", arena_codec.pack_look(look(0.1, image=IMAGE, session="7", seed=8, step=0)))
+    reply = one.http("POST", "/infer", arena_codec.pack_query(query(0.1, image=IMAGE, session="7", seed=8, step=0)))
     assert reply[0] == 200

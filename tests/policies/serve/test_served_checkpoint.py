@@ -14,7 +14,7 @@ from made_checkpoints import SIDE, facts, save
 from arena_newton.interfaces import Observation
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
-from arena_newton.policies.protocols.policy_messages import Begin, Look
+from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.serve.serve_command import make_policy
 from arena_newton.policies.serve.serve_options import ServeOptions
 
@@ -36,18 +36,18 @@ def checkpoints(narrow_resnet, tmp_path_factory):
 
 
 def shown(seed, number):
-    """State and picture of a robot's look."""
+    """State and picture of a robot's query."""
     rng = np.random.default_rng([seed, number])
     state = 0.1 * rng.standard_normal(64).astype(np.float32)
     state[[0, 3]] = 1.0
     return state, rng.integers(0, 256, (SIDE, SIDE, 3), np.uint8)
 
 
-def alone(policy, seed, looks):
+def alone(policy, seed, queries):
     """Chunks of one world in this process."""
     policy.reset([seed], ["boxing"])
     chunks = []
-    for number in range(looks):
+    for number in range(queries):
         state, image = shown(seed, number)
         seen = Observation(
             torch.from_numpy(state)[None],
@@ -72,13 +72,13 @@ def test_robots_are_served_as_if_alone(served, checkpoints, family, options):
     assert one.server.facts.labels == "v3.1" and one.server.facts.picture.width == SIDE
     assert one.server.facts.chunk_length == {"replan": 2, "ensemble": 1}.get(next(iter(options), ""), 6)
 
-    def play(seed, looks=4):
+    def play(seed, queries=4):
         one.server.begin(str(seed), Begin("", seed, "boxing"))
         chunks, step = [], 0
-        for number in range(looks):
+        for number in range(queries):
             state, image = shown(seed, number)
-            look = Look(state, image, "boxing", SENTENCE, seed=seed, step=step)
-            chunks.append(one.server.look(str(seed), look).actions)
+            query = Query(state, image, "boxing", SENTENCE, seed=seed, step=step)
+            chunks.append(one.server.query(str(seed), query).actions)
             step += len(chunks[-1])
         one.server.leave(str(seed))
         return chunks
@@ -98,5 +98,5 @@ def test_raw_labels_are_the_networks(served, checkpoints):
     one = served(make_policy(options, torch.device("cpu")), max_sessions=2)
     assert one.server.facts.labels == "v4" and one.server.facts.realign == 0.002
     state, image = shown(3, 0)
-    chunk = one.server.look("a", Look(state, image, "boxing", SENTENCE, seed=3, step=0)).actions
+    chunk = one.server.query("a", Query(state, image, "boxing", SENTENCE, seed=3, step=0)).actions
     assert np.array_equal(chunk, alone(LeRobotPolicy(checkpoints["act"]), 3, 1)[0])

@@ -79,7 +79,7 @@ class Chromium:
         self.call("Page.navigate", url=url)
 
     def value(self, expression: str) -> object:
-        """What a JavaScript expression gives."""
+        """Value of a JavaScript expression."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")

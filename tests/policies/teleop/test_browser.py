@@ -185,7 +185,7 @@ def test_a_path_that_is_no_text_is_not_found(server):
 
 @pytest.mark.parametrize("message", ["x", '{"forward": "fast"}', '{"x": 1}', b"\xff\x00", "[" + "1," * 5000 + "1]"])
 def test_an_unfit_message_ends_the_page_alone(server, message):
-    """Whatever a page sends, it loses its socket at worst; the next one is served."""
+    """A page that sends anything else loses its socket at worst; the next one is served."""
     with page_socket(server) as page:
         page.recv(timeout=READY)
         page.send(message)

@@ -152,7 +152,7 @@ def test_pictures_are_put_off_before_ticks_are_late():
     ],
 )
 def test_a_message_that_is_wrong_is_refused(message, named):
-    """Whatever a page may not send is refused, and the message says which field it is."""
+    """A message that a page may not send is refused by the name of its field."""
     with pytest.raises(InputError, match=named):
         read_held(message)
 

@@ -1,4 +1,4 @@
-"""What tests of training share: one small dataset per session."""
+"""Fixtures of training: one small dataset per session."""
 
 import os
 

@@ -26,14 +26,16 @@ def padded(rows, size, seed):
     return found
 
 
-def make_dataset(folder, *, labels="v3.1", lengths=LENGTHS, task="boxing", pictures=padded, size=SIZE):
-    """Write a dataset into `folder/<task>` and return it."""
-    recordings = folder / f"{task}_recordings"
+def make_dataset(
+    folder, *, labels="v3.1", lengths=LENGTHS, task="boxing", tracker="twist2", pictures=padded, size=SIZE
+):
+    """Write a dataset into `folder/<task>_<tracker>_<labels>` and return it."""
+    recordings = folder / f"{task}_{tracker}_recordings"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(made_episodes, "pictures", pictures)
         for repeat, rows in enumerate(lengths):
-            consistent_episode(recordings, rows, repeat=repeat, size=size, task=task)
-    out = folder / f"{task}_{labels}"
+            consistent_episode(recordings, rows, repeat=repeat, size=size, task=task, tracker=tracker)
+    out = folder / f"{task}_{tracker}_{labels}"
     write_dataset(choose(episode_files([recordings])), out, kind=LAYOUTS["arena"], labels=labels)
     return out
 

@@ -87,7 +87,7 @@ def test_a_compiled_step_is_captured(dataset, tmp_path, compiler):
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name not in UNCOMPILED])
 def test_nearly_all_parameters_are_compiled(family):
-    """What a family has compiled holds nearly all parameters that learn, and keeps their names."""
+    """Compiled parts of a family hold nearly all parameters that learn, and keep their names."""
     model = families.build(recipe(family, "small"), made_stats(), "cpu")
     names = list(model.policy.state_dict())
     called = {id(p) for part in model.compiled_parts() for p in part.parameters()}
@@ -130,7 +130,7 @@ def test_a_missing_compiler_is_said_at_once(dataset, tmp_path, monkeypatch):
 
 
 def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, monkeypatch):
-    """What the compiler says is in one line of ours; errors of other kinds stay what they are."""
+    """A compiler's complaint is in one line of ours; errors of other kinds stay what they are."""
     broken = tmp_path / "g++"
     broken.write_text("#!/bin/sh\necho broken >&2\nexit 1\n")
     broken.chmod(0o755)

@@ -185,7 +185,7 @@ def test_processes_end_with_a_training_that_is_killed():
 
 
 def running(number):
-    """Whether a process is there and no zombie."""
+    """True if a process is there and no zombie."""
     try:
         return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -193,7 +193,7 @@ def running(number):
 
 
 def test_no_memory_to_share_is_an_error(rows):
-    """Where no memory can be shared the error says how much was asked for, why not, and what to do."""
+    """An error about memory that cannot be shared says how much was asked for, why not, and what to do."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
     try:
@@ -228,7 +228,7 @@ def test_words_of_an_interpreters_start_are_no_messages(rows, tmp_path, monkeypa
 
 
 def test_processes_start_where_the_standard_input_is_closed():
-    """Whoever started the training may have closed its input: memory is not in its position."""
+    """A training whose standard input is closed puts no memory in its position."""
     child = Child("tests.policies.train.pool_owners:without_input", [])
     assert child.wait(300) == 0, child.printed()
 

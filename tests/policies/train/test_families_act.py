@@ -26,7 +26,7 @@ def model():
 
 
 def test_loss_is_lerobots(model):
-    """The loss, with dropout and latent, and its gradients are those of `ACTPolicy.forward`."""
+    """Loss and gradients, with dropout and latent, are `ACTPolicy.forward`'s; it is the mean of its samples' losses."""
     batch = made_batch(model)
     found = []
     for loss_of in (lambda: model.loss(batch, model.noise(2)), lambda: model.policy.forward(batch)[0]):
@@ -37,6 +37,8 @@ def test_loss_is_lerobots(model):
         found.append((loss.detach(), model.policy.model.action_head.weight.grad.clone()))
     assert torch.allclose(found[0][0], found[1][0], rtol=1e-6)
     assert torch.allclose(found[0][1], found[1][1], rtol=1e-5, atol=1e-8)
+    loss, each = model.losses(batch)
+    assert torch.allclose(each.mean(), loss) and each[0] != each[1]
 
 
 def test_padding_does_not_count(model):
@@ -74,7 +76,7 @@ def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
 
 
 def test_normalisation_is_lerobots(model):
-    """What the trainer does on the GPU is what LeRobot's processors do, constant numbers included."""
+    """Normalisation on the GPU is that of LeRobot's processors, constant numbers included."""
     observation = raw_observation()
     theirs = model.preprocess(dict(observation))
     for name in ("observation.images.front", "observation.state"):

@@ -28,7 +28,7 @@ def lerobots(model, batch):
 
 @pytest.mark.parametrize(("prediction", "mask"), [("epsilon", False), ("sample", True)])
 def test_loss_is_lerobots(model, monkeypatch, mask, prediction):
-    """With the same random numbers the loss and its gradients are those of `DiffusionPolicy.forward`."""
+    """With equal noise loss and gradients are `DiffusionPolicy.forward`'s; it is the mean of its samples' losses."""
     monkeypatch.setattr(model.policy.config, "do_mask_loss_for_padding", mask)
     monkeypatch.setattr(model.policy.config, "prediction_type", prediction)
     batch = made_batch(model)
@@ -42,6 +42,8 @@ def test_loss_is_lerobots(model, monkeypatch, mask, prediction):
         found.append((loss.detach(), gradients))
     assert torch.allclose(found[0][0], found[1][0], rtol=1e-5)
     assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(found[0][1], found[1][1], strict=True))
+    loss, each = model.losses(batch)
+    assert torch.allclose(each.mean(), loss) and each[0] != each[1]
 
 
 def test_noise_decides_the_loss(model):

@@ -44,7 +44,7 @@ def lerobots(batch):
 
 @pytest.mark.parametrize("mask", [False, True])
 def test_loss_is_lerobots(model, monkeypatch, mask):
-    """With the same random numbers the loss and its gradients are those of `MultiTaskDiTPolicy.forward`."""
+    """With equal noise loss and gradients are `MultiTaskDiTPolicy.forward`'s; it is the mean of its samples' losses."""
     model.policy.eval()
     monkeypatch.setattr(model.policy.config, "do_mask_loss_for_padding", mask)
     monkeypatch.setattr(model.policy.objective, "do_mask_loss_for_padding", mask)
@@ -59,6 +59,8 @@ def test_loss_is_lerobots(model, monkeypatch, mask):
         found.append((loss.detach(), [p.grad.clone() for p in model.policy.parameters() if p.grad is not None]))
     assert torch.allclose(found[0][0], found[1][0], rtol=1e-6)
     assert all(torch.allclose(a, b, rtol=1e-4, atol=1e-7) for a, b in zip(found[0][1], found[1][1], strict=True))
+    loss, each = model.losses(batch, noise)
+    assert torch.allclose(each.mean(), loss) and each[0] != each[1]
     model.policy.train()
 
 

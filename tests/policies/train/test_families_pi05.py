@@ -45,7 +45,7 @@ def base(tmp_path):
 
 
 def test_loss_is_lerobots(model, monkeypatch):
-    """With the same random numbers the loss and its gradients are those of `PI05Policy.forward`."""
+    """With equal noise loss and gradients are `PI05Policy.forward`'s; it is the mean of its samples' losses."""
     batch, noise = made_batch(model), model.noise(2)
     monkeypatch.setattr(model.policy.model, "sample_noise", lambda shape, device: noise["noise"])
     monkeypatch.setattr(model.policy.model, "sample_time", lambda rows, device: noise["time"])
@@ -57,6 +57,8 @@ def test_loss_is_lerobots(model, monkeypatch):
         found.append((loss.detach(), model.policy.model.action_in_proj.weight.grad.clone()))
     assert torch.equal(found[0][0], found[1][0])
     assert torch.allclose(found[0][1], found[1][1])
+    loss, each = model.losses(batch, noise)
+    assert torch.allclose(each.mean(), loss) and each[0] != each[1]
     assert noise["noise"].shape == (2, 20, 40)
 
 

@@ -19,7 +19,7 @@ from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames import frame_store
 from arena_newton.policies.train.frames.augmentation import gathered_pictures
-from arena_newton.policies.train.frames.batching import BatchMaker, RowOrder, step_seed
+from arena_newton.policies.train.frames.batching import BalancedOrder, BatchMaker, RowOrder, step_seed
 from arena_newton.policies.train.frames.demonstration_rows import read_rows, statistics
 from arena_newton.policies.train.frames.frame_store import load_frames, made_frames
 from arena_newton.policies.train.network_memory import SIZES, network_bytes
@@ -150,15 +150,71 @@ def test_a_batch_ends_where_its_episode_ends(store):
 
 def test_several_datasets_are_one_set(dataset, rows, tmp_path):
     """Two datasets' episodes follow each other, each row with its own task and instruction."""
-    other = read_rows(make_dataset(tmp_path, lengths=(22,), task="football"), "v4")
+    other = read_rows(make_dataset(tmp_path, lengths=(22,), task="football", tracker="sonic"), "v4")
     store = load_frames([rows, other], CPU)
     assert store.rows == sum(LENGTHS) + 22 and store.tasks == ("boxing", "football")
+    assert store.pairs == (("boxing", "twist2"), ("football", "sonic"))
     batches = BatchMaker(store, unchanged, range(3), task_vector=("football", "boxing"))
-    batch = batches(torch.tensor([0, store.rows - 1]))
+    batch = batches(torch.tensor([0, store.rows - 1]), unknown=1.0)
     assert batch["observation.environment_state"].tolist() == [[0.0, 1.0], [1.0, 0.0]]
     words = [store.instructions[n] for n in store.instruction[[0, store.rows - 1]].tolist()]
     assert words == [rows.episodes[0].instruction, other.episodes[0].instruction] and words[0] != words[1]
     assert store.first[-1] == sum(LENGTHS) and torch.equal(store.actions[-22:], torch.tensor(other.episodes[0].actions))
+
+
+def test_the_vector_names_the_tracker_of_a_row(rows, tmp_path):
+    """After the task's numbers come those of the trackers and one of any other, which the wanted fraction has."""
+    other = read_rows(make_dataset(tmp_path, lengths=(22,), tracker="sonic"), "v4")
+    batches = BatchMaker(
+        load_frames([rows, other], CPU), unchanged, range(3), task_vector=("boxing",), tracker_vector=("sonic",)
+    )
+    last = batches.store.rows - 1
+    told = batches(torch.tensor([0, last]))["observation.environment_state"]
+    assert told.tolist() == [[1.0, 0.0, 1.0], [1.0, 1.0, 0.0]]
+    torch.manual_seed(2)
+    told = batches(torch.full((4000,), last), unknown=0.25)["observation.environment_state"]
+    assert torch.equal(told[:, 1] + told[:, 2], torch.ones(4000)) and 0.22 < told[:, 2].mean() < 0.28
+
+
+def test_every_fourth_picture(rows, store):
+    """Samples begin at every fourth row of each episode, with its own picture; actions are those of all rows."""
+    thin = load_frames([rows], CPU, hold_out=1, every=4, jobs=1)
+    starts = np.cumsum([0, *LENGTHS])
+    kept = [row for first, last in itertools.pairwise(starts) for row in range(first, last, 4)]
+    assert torch.equal(thin.pictures, store.pictures[kept]) and torch.equal(thin.actions, store.actions)
+    assert [*thin.samples(), *thin.samples(held=True)] == kept
+    chosen = torch.tensor(kept[5:12])
+    assert torch.equal(gathered_pictures(thin, chosen), gathered_pictures(store, chosen))
+    by_processes = load_frames([rows], CPU, every=4, jobs=2, processes=2)
+    assert torch.equal(by_processes.pictures, thin.pictures)
+
+
+def test_the_picture_without_its_pad(store):
+    """Cut about its middle it is what the camera sees without bars, and a shift repeats the edges of that."""
+    chosen = torch.arange(4)
+    cut = gathered_pictures(store, chosen, tall=SIZE - 2 * BAND)
+    assert torch.equal(cut, gathered_pictures(store, chosen)[:, :, BAND:-BAND])
+    less = dataclasses.replace(store, top=BAND - 3, bottom=BAND - 1)  # rows with traces of a codec are kept
+    padded = torch.nn.functional.pad(store.pictures, (0, 0, 0, 0, 3, 1), value=9)
+    less = dataclasses.replace(less, pictures=padded)
+    assert torch.equal(gathered_pictures(less, chosen, tall=SIZE - 2 * BAND), cut)
+    assert gathered_pictures(less, chosen, tall=SIZE - 2 * BAND, shift=4).min() > 0.1
+    assert torch.equal(gathered_pictures(store, chosen, tall=SIZE - BAND)[:, :, BAND // 2 : -BAND // 2], cut)
+
+
+def test_balanced_rows_have_the_wanted_fractions():
+    """Groups are drawn by their weights, rows of a group alike; step, seed and process alone decide, as on a resume."""
+    samples, groups = np.arange(1000, 1111), np.repeat([1, 0, 2], [1, 10, 100])
+    order = BalancedOrder(samples, groups, [1.0, 2.0, 5.0], 7, CPU)
+    taken = np.concatenate([order.rows(step, 64).numpy() for step in range(500)])
+    counts = [np.isin(taken, samples[groups == group]).sum() / len(taken) for group in range(3)]
+    assert counts == pytest.approx([0.125, 0.25, 0.625], abs=0.01)
+    within = np.bincount(taken - 1000, minlength=111)[1:11]
+    assert within.min() > 300 and within.max() < 500
+    assert torch.equal(BalancedOrder(samples, groups, [1.0, 2.0, 5.0], 7, CPU).rows(321, 64), order.rows(321, 64))
+    others = [order.rows(321, 64, rank=1, ranks=2), order.rows(322, 64)]
+    others += [BalancedOrder(samples, groups, [1.0, 2.0, 5.0], 8, CPU).rows(321, 64)]
+    assert not any(torch.equal(other, order.rows(321, 64)) for other in others)
 
 
 def test_held_out_rows_are_not_sampled(store):
@@ -170,7 +226,7 @@ def test_held_out_rows_are_not_sampled(store):
 
 
 def test_an_epoch_has_every_row_once():
-    """Whatever the batch and the number of processes, rows come once per epoch, in one order, from any step on."""
+    """Rows come once per epoch, in one order, from any step on, for any batch and number of processes."""
     samples = np.arange(100, 137)
     for batch, ranks in ((5, 1), (64, 1), (3, 2)):
         order = RowOrder(samples, 7, CPU)

@@ -154,5 +154,5 @@ def test_a_training_applies_what_its_recipe_says(monkeypatch):
         trainer.advance()
         losses.append(float(trainer.loss))
         trainer.held = trainer.samples[:4]
-        trainer.held_out_loss()
+        trainer.held_out_losses()
     assert drawn == [(settings.batch_size, 64, 64, CPU)] and losses[0] != losses[1]

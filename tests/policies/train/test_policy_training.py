@@ -63,7 +63,7 @@ def weights(folder):
 
 
 def same(one, two):
-    """Whether two sets of tensors are equal to the last bit."""
+    """True if two sets of tensors are equal to the last bit."""
     return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
 
 
@@ -169,7 +169,7 @@ def test_a_finished_training_is_not_repeated(whole, monkeypatch):
 
 
 def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_path, monkeypatch):
-    """Whichever part of a checkpoint cannot be written, the one before is whole, and the training goes on from it."""
+    """A checkpoint of which any part cannot be written leaves the one before whole, from which the training goes on."""
     real = {name: getattr(training_state, name) for name in ("_write_optimizer", "_synced", "save_rng_state")}
     for number, name in enumerate(real):
         out = tmp_path / str(number)
@@ -190,7 +190,7 @@ def test_a_failing_disk_leaves_the_last_whole_checkpoint(dataset, whole, tmp_pat
 
 
 def test_a_full_disk_is_one_error(dataset, tmp_path, capsys):
-    """What safetensors and the log cannot write is a message with the path and code 2; no part of it takes space."""
+    """A full disk under safetensors or the log is a message with the path and code 2; no part of it takes space."""
     out = tmp_path / "run"
     given = ["--dataset", str(dataset), "--recipe", "small", "--device", "cpu", "--steps", "1", "--out", str(out)]
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

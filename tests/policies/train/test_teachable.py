@@ -47,7 +47,7 @@ def quat(yaw):
 
 
 def test_an_object_is_seen_from_the_robot():
-    """Where the whole scene is moved and turned, only the robot's own pose changes in what the network is given."""
+    """A whole scene that is moved and turned changes only the robot's own pose in the network's input."""
     state = torch.zeros(1, 64)
     for yaw, away in ((0.7, (3.0, -2.0)), (3.0, (0.0, 9.0))):
         turn = torch.tensor([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])

@@ -42,7 +42,7 @@ def library() -> MotionLibrary:
 
 
 def integrated(actions: np.ndarray, root_xy: np.ndarray, yaw: float) -> dict[str, np.ndarray]:
-    """What the kernels make of a stream of actions, tick by tick."""
+    """Result of the kernels for a stream of actions, tick by tick."""
     ref = ReferencePose.allocate(1, "cpu", canonical_to_mujoco=CANONICAL_TO_MUJOCO, tick=TICK)
     qpos = np.array([[*root_xy, 0.8, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]], dtype=np.float32)
     mask = wp.array([1], dtype=wp.int32, device="cpu")
@@ -177,7 +177,7 @@ def test_mirror(library):
 
 
 def test_from_random():
-    """What the generator returns, as tensors, becomes named clips of equal length with their supports."""
+    """Tensors of the generator become named clips of equal length with their supports."""
     clips = [wave(30, seed) for seed in range(4)]
     generated = {
         "root_pos": torch.tensor(np.array([c.root_pos for c in clips])),

@@ -200,7 +200,7 @@ def _of_side(values: Tensor, side: Tensor) -> Tensor:
 
 
 def _chosen(side: Tensor, where: Tensor) -> Tensor:
-    """Which feet are of the side, in the worlds of a mask, bool, shape [worlds, 2]."""
+    """Feet of the side, in the worlds of a mask, bool, shape [worlds, 2]."""
     return torch.stack([side == 0, side == 1], dim=1) & where[:, None]
 
 
@@ -236,7 +236,7 @@ def _advance_phase(s: TorchGait, moving: Tensor, free: Tensor, step_time: Tensor
 
 
 def _plan_landing(s: TorchGait, begin: Tensor, swing: Tensor, step_time: Tensor) -> None:
-    """Where the swing foot lands, and on which ground."""
+    """Landing of the swing foot, and the ground of it."""
     remaining = (1.0 - s.phase).clamp(min=0.0) * step_time
     planned = _of_side(_nominal_feet(s, remaining + FOOT_LEAD * step_time), s.side)
     # Onto other ground goes the foot that leads by enough for the edge between them, and then the other one.

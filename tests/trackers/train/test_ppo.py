@@ -92,7 +92,7 @@ def test_a_minibatch_learns_only_what_may_learn():
 
 
 class Tape(TorchDispatchMode):
-    """What a CUDA graph is, on the CPU: the operations of some work, done again on the very same tensors."""
+    """A CUDA graph's meaning on the CPU: the operations of some work, done again on the very same tensors."""
 
     def __init__(self):
         super().__init__()

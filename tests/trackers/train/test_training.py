@@ -356,7 +356,7 @@ def test_a_resumed_training_tells_of_all_its_parts(env, tmp_path, capsys):
 
 
 def test_other_references_start_without_evidence(env, trained, tmp_path, capsys):
-    """What was learnt about one library's clips says nothing about another's of the same shape."""
+    """Evidence about one library's clips says nothing about another's of the same shape."""
     state = torch.load(trained.folder / "model_last.pt", weights_only=True)
     state["sampler"] |= {"library": "another", "seconds": state["sampler"]["seconds"] + 1e6}
     torch.save(state, tmp_path / "other.pt")

@@ -1,4 +1,4 @@
-"""What of rsl_rl is overridden here: when one of these signatures moves, the override must be read again."""
+"""Methods of rsl_rl that are overridden here: when a signature moves, the override must be read again."""
 
 import inspect
 

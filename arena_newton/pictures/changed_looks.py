@@ -1,0 +1,319 @@
+"""Changed looks of pictures whose shapes are known: other colours, patterns, lights, things in the room, exposure.
+
+A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
+work can be captured in a CUDA graph. Texture and shading of a shape stay: each pixel's luminance over the mean of its
+shape times the new colour. The robot and shapes whose colour matters keep theirs, and nothing is put before them.
+
+What semantic mode shows is not among the looks: every drawn colour is one of `palette`, which keeps its distance from
+`SEMANTIC_COLOURS`; so a brick is never drawn in the colour of that mode's bricks. Lights are those of the recording.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+__all__ = ["SEMANTIC_COLOURS", "Changes", "changed_looks", "luminance", "palette", "recoloured", "seen_colours"]
+
+SEMANTIC_COLOURS = (
+    (0.05, 0.85, 0.1),  # the cube on the bag
+    (0.35, 0.55, 0.8),  # window panes
+    (0.8, 0.22, 0.02),  # the goal's net
+    (0.05, 0.16, 0.38),  # the door leaf
+    (0.62, 0.74, 0.78),  # its window
+    (0.55, 0.04, 0.03),  # tins
+    (0.03, 0.25, 0.1),  # a case
+    (0.25, 0.16, 0.1),  # skirting
+    (0.1, 0.19, 0.33),  # sofa
+    (0.22, 0.12, 0.06),  # table
+    (0.93, 0.78, 0.03),  # the ring on the floor
+    (0.92, 0.92, 0.92),  # the sign's post
+    (0.95, 0.36, 0.03),  # its plate
+    (0.413, 0.202, 0.078),  # wood.png
+    (0.342, 0.162, 0.06),  # wood.png
+    (0.089, 0.037, 0.014),  # wood.png
+    (0.314, 0.065, 0.04),  # brick.png
+    (0.503, 0.468, 0.413),  # brick.png
+    (0.386, 0.089, 0.053),  # brick.png
+    (0.01, 0.01, 0.01),  # hazard.png
+    (0.839, 0.515, 0.007),  # hazard.png
+    (0.61, 0.125, 0.015),  # basketball.png
+    (0.012, 0.008, 0.007),  # basketball.png
+    (0.521, 0.098, 0.01),  # basketball.png
+    (0.584, 0.402, 0.209),  # cardboard.png
+    (0.44, 0.227, 0.084),  # cardboard.png
+    (0.231, 0.107, 0.037),  # cardboard.png
+    (0.68, 0.658, 0.617),  # tiles.png
+    (0.246, 0.238, 0.223),  # tiles.png
+    (0.617, 0.597, 0.552),  # tiles.png
+    (0.275, 0.093, 0.076),  # carpet.png
+    (0.235, 0.076, 0.065),  # carpet.png
+    (0.202, 0.065, 0.054),  # carpet.png
+)
+"""Albedo of what semantic mode and the variant scenes show and base mode does not, linear RGB; of a texture its main
+colours."""
+APART = 0.07
+"""Least distance of a drawn colour from each of them as a picture shows it, in RGB from 0 to 1."""
+COLOURS = 4096
+"""Colours of the palette."""
+DOME = 3000.0 * 0.75 / 1700.0
+"""Exposure of the scenes' dome (`kernels.pictures.lighting`)."""
+FACINGS = (0.45, 0.6, 0.725, 0.85, 1.0)
+"""Light of the dome on surfaces that face down to up (`BOUNCE` to 1)."""
+LUMA = (77.0, 150.0, 29.0)
+"""Weights of red, green and blue in luminance, of 256 (Rec. 601)."""
+SHAPES = 256
+"""Values of a byte that names a shape."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Probability of each kind of change in a sample whose look changes."""
+
+    colours: float = 0.85
+    """New colours of shapes or whole objects."""
+    patterns: float = 0.5
+    """A pattern instead of one colour, of each shape that gets another."""
+    light: float = 0.6
+    """A fraction of the second light."""
+    things: float = 0.2
+    """Something cut out of another task's picture."""
+    rectangles: float = 0.1
+    exposure: float = 0.8
+    """Gain, gamma, cast, a smooth field, noise."""
+
+
+def seen_colours(albedo: np.ndarray) -> np.ndarray:
+    """Colours of surfaces in a picture under the scenes' dome, sRGB from 0 to 1, shape [n · 5, 3].
+
+    Args:
+        albedo: Linear RGB, shape [n, 3].
+    """
+    linear = 1.0 - np.exp(-DOME * np.asarray(albedo)[:, None, :] * np.array(FACINGS)[:, None])
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).reshape(-1, 3)
+
+
+@functools.cache
+def palette(device: torch.device) -> torch.Tensor:
+    """All colours that shapes may get, sRGB from 0 to 1, float32, shape [4096, 3]."""
+    rng = np.random.default_rng(0)
+    hue, grey, saturation, value = rng.random((4, 4 * COLOURS))
+    saturation = np.where(grey < 0.35, 0.25 * saturation, 0.2 + 0.75 * saturation)
+    value = 0.06 + 0.88 * value
+    offsets = (hue[:, None] * 6.0 + np.array([5.0, 3.0, 1.0])) % 6.0
+    drawn = value[:, None] * (1.0 - saturation[:, None] * np.clip(np.minimum(offsets, 4.0 - offsets), 0.0, 1.0))
+    shown = seen_colours(np.array(SEMANTIC_COLOURS).reshape(-1, 3))
+    apart = np.linalg.norm(drawn[:, None] - shown[None], axis=2).min(axis=1, initial=1.0) >= APART
+    return torch.from_numpy(drawn[apart][:COLOURS].astype(np.float32)).to(device)
+
+
+def changed_looks(
+    seen: torch.Tensor,
+    frames: torch.Tensor,
+    chances: torch.Tensor,
+    objects: torch.Tensor,
+    task: torch.Tensor,
+    changes: Changes = Changes(),  # noqa: B008  # a constant
+) -> torch.Tensor:
+    """Change the look of every sample of a batch, each in its own way.
+
+    Args:
+        seen: Pictures, uint8, shape [B, H, W, 3].
+        frames: Their looks, a shape and two light ratios per pixel, uint8, shape [B, H, W, 3] (`data.readers.looks`).
+        chances: Probability of another colour of each shape, float32, shape [B, 256].
+        objects: First shape of the object that each shape is part of, int64, shape [B, 256].
+        task: Number of each sample's task, int64, shape [B]; things are cut out of another task's pictures.
+        changes: Probabilities.
+
+    Returns:
+        0 to 1, float32, shape [B, H, W, 3].
+    """
+    batch, height, width = seen.shape[:3]
+    device = seen.device
+    shapes = frames[..., 0].reshape(batch, -1).long()
+    chance = chances.gather(1, shapes)
+    luma = luminance(seen).reshape(batch, -1)
+    pixels = seen.reshape(batch, -1, 3).float() / 255.0
+    owner = objects.gather(1, shapes)
+    pixels = recoloured(pixels, luma, shapes, owner, chance, (height, width), changes)
+    free = chance >= 1.0
+    pixels = _with_things(pixels, luma, owner, chance, free, task, (height, width), changes.things)
+    inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
+    pixels = torch.where(inside[..., None], _colours((batch, 1), device), pixels)
+    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., 2]).float()
+    ratio = torch.exp2((lit.reshape(batch, -1) - 128.0) / 32.0)
+    weight = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.light, device)
+    pixels = pixels * (1.0 + weight * (ratio - 1.0))[..., None]
+    return _exposed(pixels.clamp_(0.0, 1.0).view(batch, height, width, 3), changes.exposure)
+
+
+def recoloured(
+    pixels: torch.Tensor,
+    luma: torch.Tensor,
+    shapes: torch.Tensor,
+    owner: torch.Tensor,
+    chance: torch.Tensor,
+    size: tuple[int, int],
+    changes: Changes,
+) -> torch.Tensor:
+    """Give shapes, or whole objects, another colour or a pattern of three.
+
+    Args:
+        pixels: 0 to 1, shape [B, P, 3].
+        luma: Luminance of each pixel, 0 to 255, int64, shape [B, P].
+        shapes: Shape of each pixel, int64, shape [B, P].
+        owner: Object of each pixel, int64, shape [B, P].
+        chance: Probability of another colour, shape [B, P].
+        size: Height and width, whose product is P.
+        changes: Probabilities.
+
+    Returns:
+        Pixels of the same shape.
+    """
+    batch, device = len(pixels), pixels.device
+    part = torch.where(torch.rand((batch, 1), device=device) < 0.5, owner, shapes)
+    rate = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.colours, device)
+    mine = torch.rand((batch, SHAPES), device=device).gather(1, part) < rate * chance
+    which = _pattern(part, size, changes.patterns)
+    chosen = torch.randint(0, COLOURS, (batch, 3 * SHAPES), device=device).gather(1, 3 * part + which)
+    shade = _shade(luma, part)[..., None]
+    return torch.where(mine[..., None], (palette(device)[chosen] * shade).clamp_(0.0, 1.0), pixels)
+
+
+@functools.cache
+def _weights(device: torch.device) -> torch.Tensor:
+    return torch.tensor(LUMA, device=device)
+
+
+def luminance(seen: torch.Tensor) -> torch.Tensor:
+    """Luma in whole numbers, 0 to 255, int64, of uint8 pictures [..., 3].
+
+    Exact in single precision, so the same on every device; and sums of it do not depend on their order.
+    """
+    return (seen.float() @ _weights(seen.device)).div_(256.0).long()
+
+
+def _shade(luma: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
+    """Luminance of each pixel over the mean of its part, shape [B, P]."""
+    sums = torch.zeros((len(luma), SHAPES), dtype=torch.int64, device=luma.device)
+    counts = torch.zeros_like(sums).scatter_add_(1, part, torch.ones_like(part))
+    mean = sums.scatter_add_(1, part, luma) / counts.clamp_min(1)
+    return ((luma + 6.0) / (mean.gather(1, part) + 6.0)).clamp_(0.0, 2.5)
+
+
+def _happens(batch: int, probability: float, device: torch.device) -> torch.Tensor:
+    """True with this probability, per sample, shape [B, 1]."""
+    return torch.rand((batch, 1), device=device) < probability
+
+
+def _colours(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    """Colours of the palette, shape [*shape, 3]."""
+    return palette(device)[torch.randint(0, COLOURS, shape, device=device)]
+
+
+def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> torch.Tensor:
+    """Which of its part's three colours each pixel has: one colour, blotches, stripes, tiles or bricks, in perspective.
+
+    Returns:
+        0, 1 or 2, int64, shape [B, P].
+    """
+    (height, width), batch, device = size, len(part), part.device
+    uniform = torch.rand((8, batch, 1, 1), device=device)
+    y = torch.linspace(-1.0, 1.0, height, device=device).view(1, -1, 1)
+    x = torch.linspace(-1.0, 1.0, width, device=device).view(1, 1, -1)
+    # A floor below a horizon, turned about the vertical; and a wall that recedes to one side.
+    away = 1.0 / (y + 0.2 + 0.8 * uniform[0] + 0.2 * (uniform[1] - 0.5) * x).clamp_min(0.06)
+    turn = math.pi * uniform[2]
+    across = x * away
+    floor = torch.cos(turn) * across - torch.sin(turn) * away, torch.sin(turn) * across + torch.cos(turn) * away
+    near = 1.0 / (1.0 + 1.4 * (uniform[3] - 0.5) * x)
+    wall = 2.0 * x * near, 2.0 * (y + 0.2 * (uniform[4] - 0.5)) * near
+    draws = torch.rand((5, batch, SHAPES), device=device)
+    lies, scale, kind, line, mixed = (draw.gather(1, part) for draw in draws)
+    scale = 0.6 * torch.exp2(3.0 * scale)
+    u, v = (
+        torch.where(lies < 0.5, one.reshape(batch, -1), other.expand(-1, height, width).reshape(batch, -1)) * scale
+        for one, other in zip(floor, wall, strict=True)
+    )
+    kind = (kind / max(probability, 1e-6) * 4.0).long()  # 4 and more: one colour
+    row = torch.floor(2.0 * v)
+    u = torch.where(kind == 3, u + 0.5 * torch.remainder(row, 2.0), u)
+    v = torch.where(kind == 3, 2.0 * v, v)
+    line = 0.03 + 0.12 * line
+    joints = (torch.remainder(u, 1.0) < line) | (torch.remainder(v, 1.0) < line)
+    cell = torch.floor(u) * 12.9898 + torch.floor(v) * 78.233 + 100.0 * uniform[5].view(-1, 1)
+    speckled = torch.remainder(torch.sin(cell) * 4375.85, 1.0) < 0.6 * mixed
+    stripes = torch.remainder(u, 1.0)
+    # Blotches: a random field of the sample, seen in the same perspective.
+    field = torch.rand((batch, 2, 24, 24), device=device)
+    where = torch.stack([torch.remainder(u / 4.0, 2.0), torch.remainder(v / 4.0, 2.0)], dim=-1) - 1.0
+    cloud = torch.nn.functional.grid_sample(field, where[:, None], padding_mode="border", align_corners=True)[:, :, 0]
+    blotch = (cloud[:, 0] > 0.55).long() + (cloud[:, 0] > 0.55).long() * (cloud[:, 1] > 0.6).long()
+    tiled = torch.where(joints, 1, 2 * speckled.long())
+    striped = torch.where(stripes < 0.5 * line * 6.0, 1, torch.where(stripes > 1.0 - mixed * 0.4, 2, 0))
+    return torch.where(kind == 0, blotch, torch.where(kind == 1, striped, torch.where(kind <= 3, tiled, 0)))
+
+
+def _with_things(
+    pixels: torch.Tensor,
+    luma: torch.Tensor,
+    owner: torch.Tensor,
+    chance: torch.Tensor,
+    free: torch.Tensor,
+    task: torch.Tensor,
+    size: tuple[int, int],
+    probability: float,
+) -> torch.Tensor:
+    """Put something out of another sample's picture somewhere, in another colour, behind what must stay visible."""
+    (height, width), (batch, count), device = size, luma.shape, luma.device
+    other = torch.randint(0, batch, (batch,), device=device)
+    at = torch.randint(0, count, (batch, 1), device=device)
+    theirs, bright = owner[other], luma[other]
+    thing = (theirs == theirs.gather(1, at)) & (chance[other] > 0.0)
+    area = thing.float().mean(dim=1, keepdim=True)
+    fits = (area > 0.001) & (area < 0.15) & (task[other] != task)[:, None] & _happens(batch, probability, device)
+    mean = (bright * thing).sum(dim=1, keepdim=True) / thing.sum(dim=1, keepdim=True).clamp_min(1)
+    shade = ((bright + 6.0) / (mean + 6.0)).clamp_(0.0, 2.5)
+    moved = torch.rand((2, batch, 1), device=device) - 0.5
+    down = torch.arange(height, device=device) + (0.6 * height * moved[0]).long()
+    right = torch.arange(width, device=device) + (0.9 * width * moved[1]).long()
+    within = ((down >= 0) & (down < height))[:, :, None] & ((right >= 0) & (right < width))[:, None, :]
+    source = down.clamp(0, height - 1)[:, :, None] * width + right.clamp(0, width - 1)[:, None, :]
+    source = source.reshape(batch, -1)
+    put = thing.gather(1, source) & within.reshape(batch, -1) & free & fits
+    colour = _colours((batch, 1), device) * shade.gather(1, source)[..., None]
+    return torch.where(put[..., None], colour.clamp_(0.0, 1.0), pixels)
+
+
+def _rectangles(batch: int, height: int, width: int, device: torch.device) -> torch.Tensor:
+    """Inside of a rectangle of each sample, bool, shape [B, P]."""
+    middle = torch.rand((2, batch, 1), device=device)
+    half = torch.rand((2, batch, 1), device=device) * 0.15 + 0.02
+    rows, columns = (
+        (torch.arange(length, device=device) / length - middle[axis]).abs() < half[axis]
+        for axis, length in enumerate((height, width))
+    )
+    return (rows[:, :, None] & columns[:, None, :]).reshape(batch, -1)
+
+
+def _exposed(pictures: torch.Tensor, probability: float) -> torch.Tensor:
+    """Gain, gamma, cast, a smooth field and noise, each in its own fraction of the samples."""
+    batch, height, width = pictures.shape[:3]
+    device = pictures.device
+
+    def drawn(low: float, high: float, *shape: int) -> torch.Tensor:
+        value = torch.rand((batch, *shape), device=device) * (high - low) + low
+        return torch.where(_happens(batch, probability, device).view(-1, *(1,) * len(shape)), value, 1.0)
+
+    field = torch.nn.functional.interpolate(
+        drawn(0.75, 1.25, 1, 3, 4), size=(height, width), mode="bilinear", align_corners=True
+    )
+    gain = drawn(0.65, 1.35, 1, 1, 1) * drawn(0.88, 1.12, 1, 1, 3)
+    pictures = (pictures * gain * field.permute(0, 2, 3, 1)).clamp_(0.0, 1.0)
+    pictures = pictures.clamp_min(1e-4) ** drawn(0.7, 1.4, 1, 1, 1)
+    noise = torch.randn(pictures.shape, device=device) * (drawn(1.0, 1.03, 1, 1, 1) - 1.0)
+    return (pictures + noise).clamp_(0.0, 1.0)

@@ -1,0 +1,130 @@
+"""Looks of the pictures on the device: which samples change theirs, and what of."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from arena_newton.data.readers.dataset_files import DatasetFiles
+from arena_newton.data.readers.looks import dataset_looks
+from arena_newton.errors import InputError
+from arena_newton.policies.train.frames.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
+from arena_newton.policies.train.frames.demonstration_rows import DatasetRows
+from arena_newton.policies.train.frames.frame_store import FrameStore, free_memory
+
+__all__ = ["LookStore", "load_looks"]
+
+
+@dataclass(frozen=True)
+class LookStore:
+    """Frames of looks of all episodes that have some, on the device of their pictures."""
+
+    frames: torch.Tensor
+    """A shape and two light ratios per pixel, uint8, shape [frames, height, width, 3], cut as the pictures."""
+    number: torch.Tensor
+    """Frame of each row, or of the last row before it that has one, int64, shape [rows]; -1: none."""
+    back: torch.Tensor
+    """Rows from that row to each row, int64, shape [rows]."""
+    table: torch.Tensor
+    """Table of each row's shapes, int64, shape [rows]."""
+    chances: torch.Tensor
+    """Probability of another colour of each shape, float32, shape [tables, 256]."""
+    objects: torch.Tensor
+    """First shape of the object that each shape is part of, int64, shape [tables, 256]."""
+    fractions: torch.Tensor
+    """Fraction of the samples of each row's task whose looks change, float32, shape [rows]."""
+
+    def chosen(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Samples whose looks change, drawn from the device's default generator.
+
+        Args:
+            rows: Rows of the samples, int64, shape [B].
+
+        Returns:
+            The rows, of a changed sample the last one that has a frame, and which ones change, bool, both of shape [B].
+        """
+        changed = (torch.rand(len(rows), device=rows.device) < self.fractions[rows]) & (self.number[rows] >= 0)
+        return torch.where(changed, rows - self.back[rows], rows), changed
+
+
+def load_looks(
+    datasets: Sequence[DatasetRows],
+    store: FrameStore,
+    fraction: float,
+    fractions: Mapping[str, float],
+    *,
+    jobs: int = 0,
+    network: int = 0,
+) -> LookStore:
+    """Decode the films of looks onto the device of the pictures.
+
+    Args:
+        datasets: Those of the pictures, in the same order.
+        store: Their pictures.
+        fraction: Fraction of the samples whose looks change.
+        fractions: The same of single tasks.
+        jobs: Cores that decode; 0: all that the process may use.
+        network: Memory that the network needs beside them [bytes].
+
+    Raises:
+        InputError: A dataset has no looks, one has damaged ones, they do not fit, or a task is none of the datasets'.
+    """
+    for task in fractions:
+        if task not in store.tasks:
+            raise InputError(f"--looks {task}=: the datasets have {', '.join(store.tasks)}")
+    films: list[EpisodeFilm] = []
+    number, back, table = (np.zeros(store.rows, np.int64) for _ in range(3))
+    number -= 1
+    tables: dict[tuple[tuple[str, float], ...], int] = {}
+    chances, objects = [np.zeros(256, np.float32)], [np.zeros(256, np.int64)]
+    row = count = 0
+    for dataset in datasets:
+        listed = dataset_looks(dataset.root, DatasetFiles(dataset.root).episodes)
+        if not any(listed):
+            raise InputError(f"--looks: {dataset.root} has none; record with `eval record --looks 1`")
+        for episode, film in zip(dataset.episodes, listed, strict=False):
+            rows = np.arange(episode.length)
+            if film is not None:
+                looks, mine = film.looks, slice(row, row + episode.length)
+                step = math.lcm(looks.stride, store.every)  # rows that have a picture too
+                frames = -(-episode.length // step)
+                number[mine], back[mine] = count + rows // step, rows % step
+                table[mine] = tables.setdefault(looks.shapes, len(tables) + 1)
+                if len(tables) == len(chances):
+                    chances.append(looks.chances())
+                    objects.append(looks.objects())
+                films.append(EpisodeFilm(dataset.root, film.episode, film.path, 0, frames, count, step // looks.stride))
+                count += frames
+            row += episode.length
+    height, width, device = store.height, store.width, store.device
+    size, free = count * int(store.pictures[0].numel()), free_memory(device) - network
+    if size > free:
+        raise InputError(
+            f"--looks: {count} frames need {size / 1e9:.1f} GB of memory on {device}, {max(0, free) / 1e9:.1f} GB are "
+            "free beside pictures and network"
+        )
+    stored = torch.empty((count, *store.pictures.shape[1:]), dtype=torch.uint8, device=device)
+
+    def put(first: int, found: np.ndarray) -> None:
+        stored[first : first + len(found)].copy_(torch.from_numpy(found))
+
+    cores = jobs or len(os.sched_getaffinity(0))
+    processes = decoding_processes(cores, count)
+    with DecoderPool(height, width, threads=cores, processes=processes, device=device) as pool:
+        for _ in pool.decode(films, store.top, store.bottom, put):
+            pass
+    shares = torch.tensor([fractions.get(task, fraction) for task in store.tasks], device=device)
+    return LookStore(
+        frames=stored,
+        number=torch.from_numpy(number).to(device),
+        back=torch.from_numpy(back).to(device),
+        table=torch.from_numpy(table).to(device),
+        chances=torch.from_numpy(np.stack(chances)).to(device),
+        objects=torch.from_numpy(np.stack(objects)).to(device),
+        fractions=shares[store.task],
+    )

@@ -1,1 +1,0 @@
-"""Boxing: reach the green target at one of two bags."""

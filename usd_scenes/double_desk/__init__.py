@@ -1,1 +1,0 @@
-"""The two-desk scene and its author."""

@@ -1,1 +1,0 @@
-"""The football scene and its author."""

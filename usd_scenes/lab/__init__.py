@@ -1,1 +1,0 @@
-"""The lab scene, on which trackers are trained and measured, and its author."""

@@ -1,1 +1,0 @@
-"""OpenDoor: press the lever, push the leaf, walk through."""

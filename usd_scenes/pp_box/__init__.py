@@ -1,1 +1,0 @@
-"""The box-to-shelf scene and its author."""

@@ -1,1 +1,0 @@
-"""SitSofa: walk round the cartons and sit down."""

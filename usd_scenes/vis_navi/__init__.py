@@ -1,1 +1,0 @@
-"""VisNavi: walk round the obstacles into the marked square."""
