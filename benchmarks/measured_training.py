@@ -30,12 +30,13 @@ from arena_newton.policies.train.frames.demonstration_rows import (
     statistics,
 )
 from arena_newton.policies.train.frames.feature_scaling import Stats
-from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_frames, made_statistics
+from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import chosen_device, fast_kernels, make_batches
 from benchmarks.bench_options import TrainingBenchOptions
+from benchmarks.made_frames import made_frames
 
 __all__ = ["READY", "WARM_STEPS", "SpeedFigure", "bench_recipe", "main"]
 

@@ -23,7 +23,6 @@ __all__ = [
     "Chunk",
     "Observation",
     "Policy",
-    "PolicyError",
     "PolicyUnavailable",
     "check_spec",
     "dataset_target",
@@ -41,16 +40,6 @@ DATASET_FILE = "meta/info.json"
 """File by which a folder is known to be a LeRobot dataset."""
 type Mask = Sequence[bool] | np.ndarray | torch.Tensor | None
 """Worlds, bool, shape [worlds]; None: all."""
-
-
-class PolicyError(ArenaError):
-    """A policy gave no usable action for one world; that world's episode ends as `error`, the others go on."""
-
-    def __init__(self, world: int, message: str):
-        """Name the world and what is wrong."""
-        super().__init__(f"world {world}: {message}")
-        self.world = world
-        self.message = message
 
 
 class PolicyUnavailable(ArenaError):

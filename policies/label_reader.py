@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.data.readers.label_protocols import LABELS, V4Decoder, protocol
+from arena_newton.data.readers.label_decoder import V4Decoder
+from arena_newton.data.readers.label_protocols import LABELS, protocol
 from arena_newton.errors import InputError
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, world_mask
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE

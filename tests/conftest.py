@@ -77,6 +77,24 @@ def no_loss_of_power():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def read_options():
+    """Flags are read from the dataclass of their command once: tyro does it for every call, in 22 ms."""
+    from tyro._parsers import ParserSpecification
+
+    read, kept = ParserSpecification.from_callable_or_type, {}
+
+    def read_once(kind, **given):
+        if given["parent_classes"] or not isinstance(kind, type):
+            return read(kind, **given)
+        key = kind, repr(given["default_instance"])
+        return kept[key] if key in kept else kept.setdefault(key, read(kind, **given))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ParserSpecification, "from_callable_or_type", staticmethod(read_once))
+        yield
+
+
 @pytest.fixture(scope="session")
 def football_native():
     """Football on native MuJoCo, three worlds."""

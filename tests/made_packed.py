@@ -6,6 +6,7 @@ import json
 import torch
 from safetensors.torch import save, save_file
 
+from arena_newton.policies.learned import act_network
 from arena_newton.policies.learned.act_network import ActNetwork, ActSizes
 from arena_newton.policies.learned.learned_card import PolicyCard
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
@@ -17,8 +18,8 @@ SMALL = {"dim_model": WIDTH, "n_heads": 2, "dim_feedforward": WIDTH, "n_encoder_
 
 
 @functools.cache
-def _weights(tasks):
-    """Content of a file of random weights for so many tasks."""
+def _weights(tasks, widths):
+    """Content of a file of random weights for so many tasks; the vision encoder has these widths."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         network = ActNetwork(ActSizes(state=64, tasks=tasks, actions=40, chunk_size=CHUNK, **SMALL))
@@ -30,7 +31,7 @@ def checkpoint(folder, tasks=("boxing", "vis_navi"), *, size=(48, 64), trackers=
     folder.mkdir(parents=True)
     facts = {"width": size[1], "height": size[0], "labels": "v4", "family": "act", "recipe": "compact"} | said
     CheckpointFacts(task_vector=tasks, tasks=tasks, trackers=trackers, **facts).write(folder)
-    (folder / "model.safetensors").write_bytes(_weights(len(tasks)))
+    (folder / "model.safetensors").write_bytes(_weights(len(tasks), act_network.WIDTHS))
     shapes = {
         "observation.images.front": ("VISUAL", [3, *size]),
         "observation.state": ("STATE", [64]),

@@ -17,6 +17,8 @@ from packaging.requirements import Requirement
 from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
 from arena_newton.eval.records.identity import UNHASHED
+from arena_newton.rules.rule_types import MODES
+from arena_newton.trackers.interface import MODULES
 from tests.import_graph import (
     INNER,
     OUTSIDE,
@@ -72,6 +74,40 @@ ANY = {
     "policies/remote/arena_client.py": "options of the command line and JSON",
 }
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
+LISTED = {
+    "task": (tasks.PAPER, {"arena_newton/tasks/__init__.py"}, 5),
+    "mode": (MODES, {"arena_newton/rules/rule_types.py"}, 2),
+    "tracker": (tuple(MODULES), {"trackers/interface.py"}, 3),
+    "channel of motion commands": (
+        "trackers/motions/commands.py:MotionCommand",
+        {"trackers/motions/commands.py", "kernels/footwork.py"},
+        2,
+    ),
+    "key of the journal": (
+        "eval/records/journal.py:EpisodeRecord",
+        {"eval/records/journal.py", "eval/play/run.py"},
+        2,
+    ),
+    "command of eval": (tuple(COMMANDS), {"eval/__main__.py"}, 2),
+}
+"""Kind of thing that is added → those that there are, or the class whose fields they are, files that list them, and
+most places of a new one: these files and its own (task: record, kernel, scene, expert; tracker: module, weights; mode:
+what it does; command: module)."""
+OF_THE_PAPER = {
+    "arena_newton/data/recording/layouts.py": "trackers that the original's datasets name",
+    "eval/certification/certify_options.py": "trackers that are certified when none is named",
+    "eval/certification/checks/failures.py": "seeds on which thresholds were set",
+    "eval/certification/checks/legs.py": "tasks of the paper that a gliding base solves, and why",
+    "eval/certification/checks/rule_ticks.py": "the paper's rules, held to a second implementation",
+    "eval/certification/checks/visible.py": "targets of the paper's tasks",
+    "eval/plan/interaction.py": "what the paper's tasks touch; a task without a row is refused --failures by name",
+    "eval/plan/options.py": "trackers of the default run",
+    "eval/studies/action_map.py": "the paper's colours",
+    "eval/tables/paper_claims.py": "the paper's claims",
+    "eval/tables/paper_numbers.py": "the paper's tables",
+    "eval/tables/suite_tables.py": "order of the paper's columns",
+}
+"""Files that list the paper's tasks, modes or trackers, or those that ship, and need no line for another one."""
 MOST_LINES = 600
 MOST_FILES = 20
 STEMS = {
@@ -268,13 +304,22 @@ def test_heavy_imports_stand_at_the_top():
     assert not set(LATE) - set(known()), "no such module"
 
 
-def test_lerobots_plug_in_is_light():
-    """Its import loads neither physics nor renderer, so that LeRobot's help and checks do not wait for them."""
+LIGHT = {
+    ("eval.adapters.lerobot_env",): {"warp", "newton", "mujoco", "pxr"},
+    ("policies.protocols.arena_codec", "policies.protocols.handshake"): {"msgpack", "websockets"},
+    ("policies.learned.learned_policy",): {"lerobot", "torchvision", "draccus", "transformers"},
+}
+"""Modules whose import does not load some libraries."""
+
+
+@pytest.mark.parametrize("modules", LIGHT, ids=" and ".join)
+def test_light_modules_stay_light(modules):
+    """LeRobot's help waits for no physics, handshakes need no `[serve]`, and packed policies no LeRobot."""
     found = [
         f"{place(known()[name], statement.lineno)}: {ast.unparse(statement)}"
-        for name in loaded(f"{PACKAGE}.eval.adapters.lerobot_env")
+        for name in loaded(*(f"{PACKAGE}.{module}" for module in modules))
         for statement, late in statements(known()[name].tree)
-        if not late and tops(statement) & {"warp", "newton", "mujoco", "pxr"}
+        if not late and tops(statement) & LIGHT[modules]
     ]
     report(found)
 
@@ -319,6 +364,51 @@ def test_what_no_run_is_known_by_moves_nothing():
             if part_of(edge.source, f"{PACKAGE}.eval") not in ("plan", "play") or not reached <= allowed:
                 found.append(f"{place(known()[edge.source], edge.line)}: imports {edge.target}")
     report(found)
+
+
+def named_together(node: ast.AST) -> set[str]:
+    """Names that a collection, a call's keywords or a class' fields list."""
+    match node:
+        case ast.Tuple(elts=parts) | ast.List(elts=parts) | ast.Set(elts=parts) | ast.Dict(keys=parts):
+            return {str(part.value) for part in parts if isinstance(part, ast.Constant)}
+        case ast.Call(keywords=keywords):
+            return {str(keyword.arg) for keyword in keywords}
+        case ast.ClassDef(body=body):
+            return {
+                line.target.id for line in body if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+            }
+    return set()
+
+
+@functools.cache
+def lists() -> list[tuple[str, set[str]]]:
+    """Names that are listed together, with their file."""
+    kinds = (ast.Tuple, ast.List, ast.Set, ast.Dict, ast.Call, ast.ClassDef)
+    return [
+        (str(module.path.relative_to(ROOT)), together)
+        for module in known().values()
+        for node in module.nodes
+        if isinstance(node, kinds) and len(together := named_together(node)) > 1
+    ]
+
+
+@pytest.mark.parametrize("kind", LISTED)
+def test_what_is_added_is_added_in_few_places(kind):
+    """Tasks, modes, trackers, channels, journal keys and commands are listed where they are registered, nowhere else.
+
+    A file lists them that names half of them together, or all where they are few.
+    """
+    names, files, most = LISTED[kind]
+    if isinstance(names, str):
+        file, _, name = names.partition(":")
+        tree = ast.parse((ROOT / file).read_text())
+        (names,) = (named_together(node) for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    own = {"task": 4, "mode": 1, "tracker": 2, "command of eval": 1}.get(kind, 0)
+    assert len(files) + own <= most
+    least = len(names) if len(names) < 5 else len(names) / 2
+    listing = {file for file, together in lists() if len(together & set(names)) >= least}
+    assert files <= listing, "the table is out of date"
+    report([f"{file}: lists each {kind}" for file in listing - files - set(OF_THE_PAPER)])
 
 
 def test_files_are_short():

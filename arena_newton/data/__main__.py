@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from arena_newton.cli.command_line import exit_code
-from arena_newton.cli.command_table import HELP, CommandRow, call, overview
+from arena_newton.cli.command_table import CommandRow, run_table
 from arena_newton.data.datasets.data_options import (
     BuildOptions,
     CleanOptions,
@@ -16,7 +15,6 @@ from arena_newton.data.datasets.data_options import (
     StatsOptions,
     VerifyOptions,
 )
-from arena_newton.errors import InputError
 
 __all__ = ["COMMANDS", "main"]
 
@@ -72,23 +70,8 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, with the arguments of the process by default.
-
-    Returns:
-        Exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted.
-    """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    return exit_code(lambda: _run(arguments))
-
-
-def _run(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in HELP:
-        print(overview("data", COMMANDS), file=sys.stdout if arguments else sys.stderr)
-        return 0 if arguments else 2
-    name = arguments.pop(0)
-    if name not in COMMANDS:
-        raise InputError(f"{name}: unknown command, known are {' '.join(COMMANDS)}")
-    return call("data", name, COMMANDS[name], arguments)
+    """Run the command line; the exit code is 1 where a check failed."""
+    return run_table("data", COMMANDS, argv)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Files and processes: own files written atomically, files of others read within limits, interrupts that wait."""
+"""Files and processes: own files, files of others within limits, stored JSON held to records, interrupts that wait."""

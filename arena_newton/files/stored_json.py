@@ -268,12 +268,13 @@ def loaded[T](where: str, values: Mapping[str, Json], kind: type[T]) -> T:
         InputError: One is absent or unfit.
     """
     fit(where, values, kind)
-    return _made(kind, values)
+    record: T = _made(kind, values)
+    return record
 
 
-def _made[T](kind: type[T], values: Mapping[str, Json]) -> T:
+def _made(kind: type, values: Mapping[str, Json]) -> Json:
     """A dataclass of values that fit it."""
-    makers = _makers(kind)  # type: ignore[arg-type]  # a type is hashable
+    makers = _makers(kind)
     given = {key: value for key, value in values.items() if key in makers}
     return kind(**{key: value if (make := makers[key]) is None else make(value) for key, value in given.items()})
 

@@ -216,7 +216,7 @@ def _colours(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
 
 
 def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> torch.Tensor:
-    """Which of its part's three colours each pixel has: one colour, blotches, stripes, tiles or bricks, in perspective.
+    """Index of the three colours of its part at each pixel: one, blotches, stripes, tiles or bricks, in perspective.
 
     Returns:
         0, 1 or 2, int64, shape [B, P].

@@ -5,8 +5,6 @@ Quaternions are wxyz. A function takes the rotation first, then what it rotates.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -32,7 +30,6 @@ __all__ = [
     "turn",
     "turned_by",
     "wrap_angle",
-    "wrap_by_remainder",
 ]
 
 
@@ -52,11 +49,6 @@ def atan2(y: Tensor, x: Tensor, *, out: Tensor | None = None) -> Tensor:
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle within -pi..pi [rad]."""
     return atan2(torch.sin(angle), torch.cos(angle))
-
-
-def wrap_by_remainder(angle: Tensor) -> Tensor:
-    """The same angle within [-pi, pi) [rad]; the last bits differ from those of `wrap_angle`."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
 
 
 def rotate_xy(yaw: Tensor, vector: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ episode can be followed alone, among others, and next to worlds that wait. A pol
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -246,6 +247,11 @@ class _Trial:
         if off > tolerance:
             raise Violation(f"{what}: actions differ by up to {off:.3g}{advice and '; ' + advice}")
 
+    @functools.cached_property
+    def usual(self) -> list[np.ndarray]:
+        """Actions of the episodes when all worlds ask each time."""
+        return self.run(self.seeds)
+
     @property
     def excused(self) -> str | None:
         """The remark of promises that this policy says it does not make."""
@@ -275,7 +281,7 @@ class _Trial:
         self.taken(self.policy.act(stage.observe(mask)), mask)
 
     def seeded(self) -> None:
-        first = self.run(self.seeds)
+        first = self.usual
         self.run(self.seeds[::-1], [[0], [0, ONLY]])
         for world, (found, expected) in enumerate(zip(self.run(self.seeds), first, strict=True)):
             self.same(found, expected, f"world {world} twice", "draw noise from the seed; forget everything in reset")
@@ -283,7 +289,7 @@ class _Trial:
     def resets(self) -> str | None:
         if self.excused:
             return self.excused
-        expected = self.run(self.seeds)
+        expected = self.usual
         asks = [range(len(self.seeds))] * (2 * ASKS)
         found = self.run(self.seeds, asks, (ASKS - 1, ONLY, self.seeds[ONLY]))
         advice = "reset must clear its worlds' memory"
@@ -299,7 +305,7 @@ class _Trial:
         if self.excused:
             return self.excused
         every = range(len(self.seeds))
-        expected = self.run(self.seeds)
+        expected = self.usual
         found = self.run(self.seeds, [every, [ONLY], [ONLY], *[[w for w in every if w != ONLY]] * 3, [ONLY], every])
         for world in every:
             what = f"world {world} when worlds ask in turn"
@@ -311,7 +317,7 @@ class _Trial:
     def rows(self) -> str | None:
         if self.excused:
             return self.excused
-        expected = self.run(self.seeds)
+        expected = self.usual
         found = self.run(self.seeds[:1] * len(self.seeds))  # the others show the episode of world 0
         self.same(found[0], expected[0], "world 0 next to other episodes", tolerance=self.tolerance)
         return None
@@ -319,7 +325,7 @@ class _Trial:
     def batch(self) -> str | None:
         if self.excused:
             return self.excused
-        among = self.run(self.seeds)
+        among = self.usual
         alone = self.run(self.seeds[:1])
         advice = "else declare depends_on_worlds = True"
         self.same(alone[0], among[0], f"world 0 alone and among {len(self.seeds)}", advice, self.tolerance)

@@ -58,6 +58,7 @@ def _range(pairs: int) -> str:
     )
 
 
+@functools.cache
 def detectable_difference(pairs: int, base: float = 0.5, *, nested: bool = False, level: float = LEVEL) -> float | None:
     """Smallest difference from a rate `base` that McNemar's exact test finds with a probability of `POWER`.
 

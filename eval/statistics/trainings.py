@@ -10,8 +10,6 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-from scipy.special import stdtr, stdtrit
-
 from arena_newton.cli.intervals import Z95
 from arena_newton.eval.statistics.stats import Outcomes, contrast, within
 
@@ -79,6 +77,8 @@ class TrainedContrast:
 
     def p(self, against: float = 0.0) -> float:
         """Two-sided probability of a sum at least as far from this value by chance."""
+        from scipy.special import stdtr  # half a second, for tables of which most have no findings
+
         return float(2 * stdtr(self.freedom, -abs(self.middle - against) / self.error))
 
 
@@ -116,6 +116,8 @@ def trained_contrast(terms: Sequence[RateTerm]) -> TrainedContrast | None:
         squared.append(own**2 / (number - 1))
     total, squares = math.fsum(variances), math.fsum(squared)
     freedom = total**2 / squares if squares else math.inf
+    from scipy.special import stdtrit
+
     half = (float(stdtrit(freedom, 0.975)) if squares else Z95) * math.sqrt(total)
     low, high = within(strata, found.middle - half, found.middle + half)
     return TrainedContrast(

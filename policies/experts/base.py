@@ -54,10 +54,7 @@ class Sight:
         self._root = qpos[:, root : root + 7]
         self._xpos, self._xquat = wp.to_torch(env.physics.xpos), wp.to_torch(env.physics.xquat)
         self._xipos = wp.to_torch(env.physics.xipos)
-        self._joint_qpos, self._joint_qvel = (
-            torch.from_numpy(addresses).long().to(self.device)
-            for addresses in (env.scene.robot.joint_qpos, env.scene.robot.joint_qvel)
-        )
+        self._joint_qpos = torch.from_numpy(env.scene.robot.joint_qpos).long().to(self.device)
         self._measured: dict[Hashable, Tensor] | None = None
 
     @contextlib.contextmanager
@@ -101,11 +98,6 @@ class Sight:
     def joints(self) -> Tensor:
         """Angles of the 29 body joints [rad], MuJoCo order, shape [worlds, 29]."""
         return self._qpos[:, self._joint_qpos]
-
-    @property
-    def joint_velocities(self) -> Tensor:
-        """Their velocities [rad/s], shape [worlds, 29]."""
-        return self._qvel[:, self._joint_qvel]
 
     def joint(self, prim: str) -> Callable[[], Tensor]:
         """Reader of the position [rad or m] of a joint prim of the scene, shape [worlds]."""

@@ -7,10 +7,8 @@ are steps of LeRobot by their registered names, of those that a policy of our fa
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import math
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -187,13 +185,11 @@ def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tupl
     fixed |= {"gradient_checkpointing": False, "push_to_hub": False, "use_amp": False}
     kept = {name: value for name, value in content.items() if name in known and name not in fixed}
     kept |= {name: value for name, value in fixed.items() if name in known}
-    with tempfile.TemporaryDirectory() as folder, lerobot_silent(), draccus.config_type("json"):
-        copy = Path(folder) / CONFIG_FILE
-        copy.write_text(json.dumps(kept))
+    with lerobot_silent():
         try:
-            config = draccus.parse(chosen, str(copy), args=[])
+            config = draccus.decode(chosen, kept)
             config.validate_features()
-        except (Exception, SystemExit) as error:  # draccus has errors of many kinds
+        except Exception as error:  # draccus has errors of many kinds
             raise InputError(f"{path}: {_reason(error)}") from None
     for one in dataclasses.fields(config):
         value = getattr(config, one.name)

@@ -44,7 +44,6 @@ __all__ = [
     "pack_query",
     "read_client",
     "unpack_begin",
-    "unpack_begun",
     "unpack_chunk",
     "unpack_config",
     "unpack_query",
@@ -95,17 +94,6 @@ def unpack_begin(body: bytes | bytearray) -> Begin:
 def pack_begun(facts: ServedFacts) -> bytes:
     """Reply to `/reset`."""
     return _dumped({"ok": True, "seeded": facts.seeded, "policy": facts.policy})
-
-
-def unpack_begun(body: bytes, where: str) -> tuple[bool, str]:
-    """True if a server honours seeds, and the name of its policy.
-
-    Raises:
-        WireError: The reply is none to `/reset`.
-    """
-    content = _object(body, where)
-    policy = content.get("policy")
-    return content.get("seeded") is True, plain_text(policy, 200) if isinstance(policy, str) else ""
 
 
 def pack_query(query: Query) -> bytes:

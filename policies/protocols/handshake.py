@@ -147,7 +147,7 @@ def read_facts(content: object, where: str) -> ServedFacts:
         raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
     declared = {key: value for key, value in content.items() if value is not None}
     try:
-        facts = loaded(f"{where}: the server declares what cannot be", declared, ServedFacts)
+        facts = loaded(f"{where}: the server declares", declared, ServedFacts)
     except InputError as error:
         raise WireError(str(error)) from None
     realign, rate = (None if number is None else float(number) for number in (facts.realign, facts.rate_hz))

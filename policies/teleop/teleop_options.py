@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.policies.protocols.ports import bind
+
 __all__ = ["BrowserOptions", "RedisOptions", "SessionOptions"]
 
 
@@ -49,6 +51,16 @@ class BrowserOptions(SessionOptions):
     """TCP port of the world's view in the page; the next one after --port when not given, 0 takes a free one."""
     no_view: bool = False
     """Leave the world's view out, on a machine that is too slow for it: the head camera's picture stays."""
+
+    def check(self) -> None:
+        """Refuse ports that are taken: libraries take seconds to load, and this shows at once.
+
+        Raises:
+            InputError: One is.
+        """
+        bind(self.port, "--port").close()
+        if not self.no_view:
+            bind(self.port_of_view(), "--view-port").close()
 
     def port_of_view(self) -> int:
         """TCP port of the world's view; 0: a free one."""

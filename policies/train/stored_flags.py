@@ -95,11 +95,11 @@ def stored_recipe(checkpoint: Path) -> TrainingRecipe:
     """
     folder = checkpoint / PRETRAINED_MODEL_DIR
     facts = CheckpointFacts.read(folder)
-    content = facts.options.get("recipe") if facts else None
+    found = facts.options.get("recipe") if facts else None
+    content = found if isinstance(found, dict) else {}
     try:
-        assert isinstance(content, dict)
         return TrainingRecipe(**content | {"betas": tuple(content["betas"])})
-    except (AssertionError, KeyError, TypeError) as error:
+    except (KeyError, TypeError) as error:
         raise InputError(
             f"{folder / FACTS_FILE}: options: recipe is not that of a training ({type(error).__name__})"
         ) from None

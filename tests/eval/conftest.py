@@ -17,6 +17,35 @@ def made_suite(tmp_path_factory):
     return write_suite(tmp_path_factory.mktemp("made") / "suite", plan())
 
 
+@pytest.fixture(scope="session")
+def cells(made_suite):
+    """Its cells."""
+    from arena_newton.eval.tables.evaluated_cells import read_cells
+
+    return read_cells([made_suite])
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """Vision encoders of packed policies have a quarter of their channels, whose numbers it gives."""
+    from arena_newton.policies.learned import act_network
+
+    widths = act_network.WIDTHS
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(act_network, "WIDTHS", tuple(width // 4 for width in widths))
+        yield widths
+
+
+@pytest.fixture(scope="module")
+def narrow_resnet():
+    """Vision encoders of LeRobot's checkpoints are narrow, too."""
+    from tests.policies.checkpoints.made_checkpoints import install
+
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch)
+        yield
+
+
 class Keepers(defaultdict):
     """Builder of environments (`Factories.env`) that hands out again what was closed: one keeper for each kind."""
 

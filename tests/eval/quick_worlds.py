@@ -10,7 +10,11 @@ from arena_newton.kernels.tick import SUCCESS
 
 
 class QuickEnv(CachedEnv):
-    """A real world but for its verdict; how long an episode takes follows from its seed."""
+    """A real world but for its verdict and its short start-up; how long an episode takes follows from its seed."""
+
+    def __init__(self, task, **options):
+        super().__init__(task, **options)
+        self.startup_ticks = 5
 
     def reset(self, seeds, worlds=None, **options):
         super().reset(seeds, worlds, **options)

@@ -13,7 +13,7 @@ from arena_newton.policies.learned import learned_card
 from tests.made_packed import packed
 
 
-def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch):
+def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch, narrow):
     """Ticks of both, in turn, as a ratio that is judged; the note says where the time of the one that sees goes."""
     monkeypatch.setattr(learned_card, "SHIPPED", packed(tmp_path / "policy", ("boxing",)))
     for name, value in (("WARM_UP", 2), ("ROUNDS", 1), ("WORLDS", (1,))):

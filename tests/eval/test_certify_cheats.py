@@ -13,7 +13,7 @@ import warp as wp
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
-from arena_newton.eval.certification.checks import replays, solvable
+from arena_newton.eval.certification.checks import inputs, replays, solvable
 from arena_newton.eval.folders.recordings import ActionRecorder
 from arena_newton.eval.play.run import Factories
 from arena_newton.policies.experts.base import ExpertPolicy
@@ -37,6 +37,8 @@ def certified(kept_worlds):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solvable, "rule_sets", lambda: ("paper",))
         patch.setattr(replays, "RECORDED_TICKS", 60)
+        patch.setattr(inputs, "HEARD_TICKS", 60)
+        patch.setattr(inputs, "SEEDS_TRIED", 1)  # in the world of the others
         yield code
 
 

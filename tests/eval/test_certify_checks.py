@@ -22,6 +22,8 @@ from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
 from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import ByRules
+from arena_newton.tasks import boxing
 
 SEEDS = [seeding.episode_seed(tasks.get("boxing").gym_id, 0, repeat) for repeat in range(300)]
 
@@ -272,8 +274,9 @@ def test_engines_that_step_other_models_differ_at_once(tmp_path, monkeypatch):
     )
 
 
-def test_a_tiny_real_certification(tmp_path, kept_worlds):
-    """One task and tracker, one episode: the expert solves it, frozen legs do not, and the strips are on the page."""
+def test_a_tiny_real_certification(tmp_path, kept_worlds, monkeypatch):
+    """One task and tracker, one episode: the expert solves it, a gliding base does not, and strips are on the page."""
+    monkeypatch.setattr(boxing, "TASK", dataclasses.replace(boxing.TASK, steps=ByRules(paper=400, released=400)))
     flags = {"task": ("boxing",), "tracker": ("twist2",), "episodes": 1, "quick": True, "worlds": 1}
     options = CertifyOptions(out=str(tmp_path), checks=("gliding-base",), **flags)
     assert certify.run(options, Factories(env=kept_worlds)) == 0

@@ -84,13 +84,18 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     log = stand_in(tmp_path, monkeypatch)
     program = tmp_path / "python"
     program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 60\n')
-    began = time.monotonic()
-    timer = threading.Timer(2.0, lambda: signal.raise_signal(signal.SIGINT))
-    timer.start()
+
+    def interrupt():
+        while not log.exists() or log.read_text().count("\n") < 2:
+            time.sleep(0.01)
+        signal.raise_signal(signal.SIGINT)
+
+    began, both = time.monotonic(), threading.Thread(target=interrupt)
+    both.start()
     with pytest.raises(KeyboardInterrupt):
         jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["football", "boxing"], ["solvable"], lambda text: None)
-    timer.join()
-    assert time.monotonic() - began < 30.0 and len(log.read_text().splitlines()) == 2
+    both.join()
+    assert time.monotonic() - began < 30.0 and log.read_text().count("\n") == 2
 
 
 def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path, monkeypatch):
@@ -125,7 +130,7 @@ def test_a_quick_check_of_any_task_has_an_outcome():
 
 
 def test_one_plan_is_not_divided(tmp_path, monkeypatch):
-    """What plays one plan of all tasks is one piece, and what plays nothing is left to the check itself."""
+    """A check that plays one plan of all tasks is one piece, and one that plays nothing is left to itself."""
     log = stand_in(tmp_path, monkeypatch)
     checks = ["statistics", "shards", "ray", "gradients"]
     jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["boxing", "football"], checks, lambda text: None)

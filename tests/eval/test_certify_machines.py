@@ -51,7 +51,7 @@ def wait_for(condition, seconds=20.0):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "it does not happen"
-        time.sleep(0.05)
+        time.sleep(0.01)
 
 
 def edit(path, old, new):
@@ -166,7 +166,7 @@ def test_without_ray_it_says_so(tmp_path, monkeypatch):
 
 def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     """Of the processes below a run the one that plays is killed, once an episode has ended and not before."""
-    monkeypatch.setattr(machines, "POLL", 0.05)
+    monkeypatch.setattr(machines, "POLL", 0.01)
     (tmp_path / "episodes.jsonl").write_text("")
     waits = "import time; time.sleep(60)"
     idle, plays = (f'(exec -a ray::RayActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
@@ -174,7 +174,7 @@ def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     try:
         wait_for(lambda: machines._actors(run.pid))
         assert len(machines._actors(run.pid)) == 1 and not (tmp_path / "gone").exists()
-        timer = threading.Timer(0.5, lambda: (tmp_path / "episodes.jsonl").write_text("{}\n{}\n"))
+        timer = threading.Timer(0.1, lambda: (tmp_path / "episodes.jsonl").write_text("{}\n{}\n"))
         timer.start()
         assert machines._kill_one(run, tmp_path) == 2
         wait_for((tmp_path / "gone").exists)

@@ -465,9 +465,17 @@ def test_a_misled_sight_displaces_what_it_says(boxing):
     assert pose == pytest.approx(np.tile([0.1, 0.2, 0.0], (2, 1)), abs=1e-6)
 
 
-def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body():
-    """Reach is from the tip of the shoe to the ball's box; a ball that is put elsewhere lies still there."""
+@pytest.fixture(scope="module")
+def football():
+    """One world of football with a short start-up, in which the ball is moved at its touch."""
     env = RelocatingEnv("football", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+    env.startup_ticks = 5
+    return env
+
+
+def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body(football):
+    """Reach is from the tip of the shoe to the ball's box; a ball that is put elsewhere lies still there."""
+    env = football
     env.reset([SEEDS[0]])
     view, ball = env.view, env.scene.joint_qpos(BALL)
     data, gaps = env.physics.data[0], []
@@ -481,18 +489,18 @@ def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body():
     stand[:, 2], stand[:, 3], stand[:, 6] = 0.8, 1.0, 1.0
     while env.tick.min() < 1:
         env.step(stand)
-    view.spec = dataclasses.replace(view.spec, touch=10.0)
+    kept, view.spec = view.spec, dataclasses.replace(view.spec, touch=10.0)
     before = data.qpos[ball : ball + 3].copy()
     for _ in range(3):
         env.step(stand)
     gone = data.qpos[ball : ball + 3] - before
     assert gone == pytest.approx(env.relocated[0].numpy(), abs=1e-3) and np.linalg.norm(gone) > 1.0
-    env.close()
+    view.spec = kept
 
 
-def test_a_reluctant_expert_halts_behind_the_ball():
+def test_a_reluctant_expert_halts_behind_the_ball(football):
     """It slows down towards the ball and stands from then on, also where it drifts back; a new episode walks again."""
-    env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
+    env = football
     env.reset([SEEDS[0]])
     policy = SABOTAGES["reluctant"].body.equip(Factories()).policy("expert")
     policy.attach(env)
@@ -509,7 +517,6 @@ def test_a_reluctant_expert_halts_behind_the_ball():
     policy.sight.goal_off += policy.sight.goal_off.new_tensor([5.0, 0.0, 0.0])
     believed, true = policy.sight.frame(GOAL)(), Sight(env).frame(GOAL)()
     assert (believed - true).numpy() == pytest.approx(np.array([[5.0, 0.0, 0.0]]), abs=1e-6)
-    env.close()
 
 
 @pytest.fixture(scope="module")
@@ -555,8 +562,8 @@ def test_saboteurs_play_more_episodes_than_worlds():
     env = ArenaEnv("boxing", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1)
     planned = [SimpleNamespace(index=n, episode_seed=seed) for n, seed in enumerate(SEEDS)]
     expert = SABOTAGES["misaimed"].body.equip(Factories()).policy("expert")
-    kept = SignalRecorder(env)
-    Rollout(env, expert, planned, recorder=kept, max_steps=30).run()
+    kept, env.startup_ticks = SignalRecorder(env), 5
+    Rollout(env, expert, planned, recorder=kept, max_steps=12).run()
     assert kept.taken(0) is not None and kept.taken(1) is not None
     env.close()
 
@@ -581,6 +588,7 @@ def test_a_weak_tracker_does_a_part_of_its_legs():
 def test_an_object_is_moved_at_its_first_touch():
     """The object leaves the touching hand's world alone, once, and comes back at the reset."""
     env = RelocatingEnv("boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", threads=1)
+    env.startup_ticks = 5
     env.reset(SEEDS)
     before = env.view.centre.clone()
     env.view.spec = dataclasses.replace(env.view.spec, touch=0.0)

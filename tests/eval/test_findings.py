@@ -25,12 +25,6 @@ RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
 @pytest.fixture(scope="module")
-def cells(made_suite):
-    """Cells of a suite of known outcomes."""
-    return read_cells([made_suite])
-
-
-@pytest.fixture(scope="module")
 def counts(made_suite, tmp_path_factory):
     """Their counts, as `tables` writes them."""
     folder = tmp_path_factory.mktemp("counts")

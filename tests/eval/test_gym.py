@@ -34,6 +34,18 @@ def watched(monkeypatch, watched_worlds):
 
 
 @pytest.fixture
+def brief(monkeypatch, watched_worlds):
+    """Start-ups of two ticks."""
+
+    def build(task, **options):
+        env = watched_worlds(task, **options)
+        monkeypatch.setattr(env, "startup_ticks", 2)
+        return env
+
+    monkeypatch.setattr(gym, "ArenaEnv", build)
+
+
+@pytest.fixture
 def make():
     """Maker of environments that are closed in the end."""
     made = []
@@ -71,7 +83,7 @@ def test_every_task_has_an_id():
     env.close()
 
 
-def test_what_it_returns_is_in_its_spaces(make):
+def test_what_it_returns_is_in_its_spaces(make, brief):
     """Observations of reset, steps and ended episodes are elements of the spaces; flags and rewards are arrays."""
     env = make(image_size=(48, 32), cameras={"front": "ego", "outside": "world"})
     observation, info = env.reset(seed=3)
@@ -98,7 +110,7 @@ def test_what_it_returns_is_in_its_spaces(make):
     assert np.array_equal(picture[1], observation["pixels"]["front"][1])
 
 
-def test_an_observation_is_the_callers(make):
+def test_an_observation_is_the_callers(make, brief):
     """A returned observation does not change with later steps."""
     env = make(image_size=(40, 32), startup="reset")
     first, _ = env.reset(seed=0)
@@ -119,7 +131,7 @@ def test_wrappers_of_gymnasium_work(make):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_one_world_passes_gymnasiums_checker():
+def test_one_world_passes_gymnasiums_checker(brief):
     """The environment of one world is what Gymnasium's own checker accepts: spaces, seeding, determinism."""
     env = gymnasium.make("arena_newton/Football-v0", engine="mujoco", device="cpu", image_size=(40, 32))
     check_env(env.unwrapped, skip_render_check=True)
@@ -172,7 +184,7 @@ def test_autoreset_plays_the_plan_as_a_rollout_does(make, watched_worlds):
         assert ended[seed] == (results[seed].outcome, results[seed].steps) == ("timeout", 8)
 
 
-def test_next_step_resets_in_the_step_after_the_end(make):
+def test_next_step_resets_in_the_step_after_the_end(make, brief):
     """NEXT_STEP: the end is returned with its own observation; the next step ignores the action and begins."""
     env = make("football", autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=2, startup="reset")
     env.reset(seed=[4, 8])
@@ -184,7 +196,7 @@ def test_next_step_resets_in_the_step_after_the_end(make):
     assert info["steps"].tolist() == [0, 0] and not np.array_equal(first["agent_pos"], last["agent_pos"])
 
 
-def test_an_ended_world_is_frozen(make):
+def test_an_ended_world_is_frozen(make, brief):
     """DISABLED: after its end a world keeps state, picture, flags and info, with reward 0, until its reset."""
     env = make(image_size=(40, 32), autoreset_mode="disabled", startup="reset", reward="margin")
     env.reset(seed=0)
@@ -212,9 +224,14 @@ def test_an_ended_world_is_frozen(make):
     assert not terminated.any() and info["steps"].tolist() == [1, tick + 2]
 
 
-@pytest.mark.parametrize("startup", gym.STARTUP)
 @pytest.mark.parametrize(
-    ("engine", "tracker", "ticks"), [("mujoco", "twist2", 10), ("mujoco", "sonic", 10), ("warp", "twist2", 2)]
+    ("engine", "tracker", "startup", "ticks"),
+    [
+        ("mujoco", "twist2", "steps", 10),
+        ("mujoco", "twist2", "reset", 10),
+        ("mujoco", "sonic", "steps", 10),
+        ("warp", "twist2", "reset", 2),  # steps of some worlds, too
+    ],
 )
 def test_resetting_one_world_changes_no_bit_of_another(make, monkeypatch, engine, tracker, ticks, startup):
     """World 1 goes through the same states whether world 0 is reset (start-up included) or not."""
@@ -263,7 +280,7 @@ def test_a_fall_in_the_start_up(make, monkeypatch):
         assert info["reason"].tolist() == ["startup_fall"] * 2 and info["steps"].tolist() == [0, 0]
 
 
-def test_an_action_that_is_not_finite_ends_one_episode(make):
+def test_an_action_that_is_not_finite_ends_one_episode(make, brief):
     """It is an error, told as truncated; the other world goes on."""
     env = make("football", startup="reset")
     env.reset(seed=0)
@@ -274,7 +291,7 @@ def test_an_action_that_is_not_finite_ends_one_episode(make):
     assert (info["final_info"]["outcome"][0], info["final_info"]["reason"][0]) == ("error", "bad_action")
 
 
-def test_the_margin_as_reward(make):
+def test_the_margin_as_reward(make, brief):
     """Its rewards add up to the change of the task's margin since the first tick."""
     env = make(reward="margin", startup="reset", autoreset_mode="disabled")
     env.reset(seed=0)
@@ -376,7 +393,7 @@ def test_wrong_options_are_refused(options, message):
         ArenaVectorEnv(**({"task": "football", "engine": "mujoco", "device": "cpu", "image_size": None} | options))
 
 
-def test_the_page_about_gymnasium():
+def test_the_page_about_gymnasium(brief):
     """Every Python block of docs/gym.md runs, one after the other, and gives what the page says."""
     page = (Path(__file__).parents[2] / "docs" / "gym.md").read_text()
     world = {"__name__": "docs_gym"}

@@ -39,13 +39,14 @@ WORLDS = 2
 
 @pytest.fixture(scope="module")
 def envs():
-    """Two worlds of each task in which objects are moved, made when they are asked for."""
+    """Two worlds of each task in which objects are moved, with short start-ups, made when they are asked for."""
     made = {}
 
     def env(task):
         if task not in made:
             tracker = trackers.get("twist2")
             made[task] = RelocatingEnv(task, tracker=tracker, worlds=WORLDS, engine="mujoco", threads=1)
+            made[task].startup_ticks = 5
         made[task].reset([seeding.episode_seed(tasks.get(task).gym_id, 0, repeat) for repeat in range(WORLDS)])
         return made[task]
 

@@ -18,13 +18,21 @@ from arena_newton.eval.folders.run_folder import stored_options
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
-from arena_newton.policies.learned import learned_card
+from arena_newton.policies.learned import act_network, learned_card
 from arena_newton.policies.learned.learned_card import read_card
 from tests.made_packed import checkpoint, packed
 
+pytestmark = pytest.mark.usefixtures("narrow")
+
+
+@pytest.fixture
+def wide(monkeypatch, narrow):
+    """Vision encoders have all channels, as in the policy that ships."""
+    monkeypatch.setattr(act_network, "WIDTHS", narrow)
+
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(narrow, tmp_path_factory):
     """A packed policy for VisNavi and Boxing through TWIST2."""
     return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"))
 
@@ -223,7 +231,7 @@ def won(line):
 
 
 @pytest.fixture(scope="module")
-def evaluated(tmp_path_factory):
+def evaluated(narrow, tmp_path_factory):
     """A checkpoint of two trackers, `made`, and runs of its packed form through one of them."""
     root = tmp_path_factory.mktemp("evaluated")
     made = checkpoint(root / "made", trackers=("twist2", "sonic"))
@@ -335,7 +343,7 @@ def test_a_damaged_card_is_one_error(folder, tmp_path, field, value):
     assert "\n" not in str(error.value)
 
 
-def test_what_ships_can_be_packed_again(tmp_path):
+def test_what_ships_can_be_packed_again(tmp_path, wide):
     """Packing the policy in the package gives the same files, and a card that says no less."""
     card = learned_card.shipped_card()
     if card is None:
@@ -348,7 +356,7 @@ def test_what_ships_can_be_packed_again(tmp_path):
     assert card.bytes == sum(p.stat().st_size for p in learned_card.SHIPPED.iterdir() if p.stem != "card")
 
 
-def test_what_ships_fits(capsys):
+def test_what_ships_fits(wide):
     """The policy in the package, if it has one, is whole, at most 32 MB, and solves what it is offered for."""
     card = learned_card.shipped_card()
     if card is None:

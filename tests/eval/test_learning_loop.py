@@ -32,7 +32,7 @@ FLAGS += ["--steps", "6", "--max-steps", "12", "--worlds", "2", "--seed", "3"]
 
 
 @pytest.fixture(scope="module")
-def looped(tmp_path_factory, kept_worlds):
+def looped(tmp_path_factory, quick_worlds):
     """A small loop: interrupted in recording and before training, killed in training, interrupted in evaluation."""
     out, codes, append = tmp_path_factory.mktemp("loop") / "out", [], Journal.append
     flags = [*FLAGS, "--out", str(out)]
@@ -43,14 +43,14 @@ def looped(tmp_path_factory, kept_worlds):
     def played(owner, name, call):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(owner, name, call)
-            codes.append(main(["loop", *flags], Factories(env=kept_worlds)))
+            codes.append(main(["loop", *flags], Factories(env=quick_worlds)))
 
     played(Journal, "append", lambda *given: (append(*given), stop()))
     first = [record.index for record in load_run(out / "demonstrations").records]
     played(learning_loop, "train", stop)
     made = {path: path.stat().st_mtime_ns for path in sorted((out / "dataset").rglob("*")) if path.is_file()}
     process = Child("killed_loop", flags)
-    assert process.wait(120) == -signal.SIGKILL, process.communicate()
+    assert process.wait(300) == -signal.SIGKILL, process.communicate()
     played(Journal, "append", lambda *given: (append(*given), stop()))
     assert len(load_run(out / "evaluation").records) == 1
     played(Journal, "append", append)

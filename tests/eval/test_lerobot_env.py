@@ -40,7 +40,7 @@ def watched(monkeypatch, watched_worlds):
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT with random weights that sways about the standing action, saved as LeRobot saves policies."""
     torch.manual_seed(7)
     config = ACTConfig(

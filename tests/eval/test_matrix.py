@@ -124,7 +124,7 @@ def test_a_finished_suite_plays_nothing(played, suite, capsys):
     assert (played / "suite.1-of-1.jsonl").read_bytes() == before
 
 
-def start(suite, out, *flags, pause="0.02"):
+def start(suite, out, *flags, pause="0.005"):
     """The command line in a process of its own."""
     return Child("eval_fakes", ["matrix", str(suite), "--out", str(out), *flags], FAKE_TICK_S=pause)
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +40,7 @@ PLUGIN = ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env",
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
+def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT like the one that ships: v4 with realignment, a task vector, pictures without bars."""
     about = facts(labels="v4", realign=0.05, family="act", task_vector=TASKS, tasks=TASKS, fit="native")
     return save(tmp_path_factory.mktemp("act"), "act", facts=about, spread=0.1)
@@ -121,7 +122,7 @@ def here(monkeypatch, kept_worlds):
             codes.append(main(command[3:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
-    monkeypatch.setattr(protocol_comparison.subprocess, "run", call)
+    monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
     return codes
 
 

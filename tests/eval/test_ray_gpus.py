@@ -63,6 +63,7 @@ with in_cluster(()):
 """A program that asks for processes and says which GPUs they see."""
 
 
+@pytest.mark.release
 def test_each_process_sees_its_gpu():
     """Processes with a GPU each see GPU 0 and GPU 1; with half a GPU each two of four see the same one."""
     done = subprocess.run([sys.executable, "-c", CREW], capture_output=True, text=True, timeout=120)

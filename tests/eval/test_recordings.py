@@ -16,7 +16,7 @@ from arena_newton.files.own_files import PARTIAL
 from arena_newton.interfaces import Observation
 from arena_newton.rules.seeding import policy_seed
 
-RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "50", "--worlds", "2"]
+RUN = ["--task", "boxing", "--seeds", "3", "--repeats", "2", "--engine", "mujoco", "--max-steps", "20", "--worlds", "2"]
 
 
 def journal(folder):
@@ -59,7 +59,7 @@ def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path, pla
     files = sorted(p.name for p in (recorded / "actions").iterdir())
     assert files == ["boxing_base_s3_r0.npz", "boxing_base_s3_r1.npz"]
     with np.load(recorded / "actions" / files[0]) as arrays:
-        assert arrays["action"].shape == (50, 40) and str(arrays["task"]).startswith("Isaac-Move-Boxing")
+        assert arrays["action"].shape == (20, 40) and str(arrays["task"]).startswith("Isaac-Move-Boxing")
     out = tmp_path / "again"
     replay = ["--policy", f"replay:{recorded / 'actions'}"]
     assert play(*RUN[:-1], "1", *replay, "--out", str(out)) == 0
@@ -90,7 +90,7 @@ def test_an_episode_without_a_recording_is_an_error_of_its_own(recorded):
 def test_modes_are_kept_apart(tmp_path, capsys, play):
     """A run of two modes plays again, each mode with its own recordings; another task is refused first."""
     out, again = tmp_path / "run", tmp_path / "again"
-    modes = [*RUN, "--mode", "base", "execution", "--max-steps", "20", "--repeats", "1"]
+    modes = [*RUN, "--mode", "base", "execution", "--max-steps", "5", "--repeats", "1"]
     assert play(*modes, "--policy", "stand", "--actions", "--out", str(out)) == 0
     replay = ["--policy", f"replay:{out / 'actions'}"]
     assert play(*modes, *replay, "--out", str(again)) == 0

@@ -49,9 +49,28 @@ def lines(folder):
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
-def start(folder, *flags, pause="0.02"):
+@pytest.fixture
+def copied(uninterrupted, tmp_path):
+    """A copy of it that a test may change."""
+    return shutil.copytree(uninterrupted, tmp_path / "copied")
+
+
+@pytest.fixture
+def half(copied):
+    """A copy whose journal ends after 30 episodes."""
+    path = copied / "episodes.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:30]))
+    return copied
+
+
+def journal(folder):
+    """Lines of a journal as JSON."""
+    return [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+
+
+def start(folder, *flags):
     """The command line in a process of its own."""
-    return Child("eval_fakes", ["run", *FLAGS, *flags, "--out", str(folder)], FAKE_TICK_S=pause)
+    return Child("eval_fakes", ["run", *FLAGS, *flags, "--out", str(folder)], FAKE_TICK_S="0.01")
 
 
 def wait_for_lines(process, folder, n):
@@ -196,7 +215,7 @@ def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrup
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert says in line and "26 of 48 episodes kept" in line and f"resume {folder}" in line
     assert "\x1b" not in line
-    records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    records = journal(folder)
     assert len(records) == 26 and all(r["outcome"] != "error" for r in records)
     assert main(["resume", str(folder)], factories()) == 0
     assert tables(folder) == tables(uninterrupted)
@@ -224,7 +243,7 @@ def test_an_episode_that_always_breaks_can_be_passed(tmp_path, uninterrupted, ca
     output = capsys.readouterr().out
     assert "   1 x environment: RuntimeError: always here" in output
     assert f"resume {folder} --retry-errors" in output
-    records = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    records = journal(folder)
     assert len(records) == 48
     broken = [(r["task"], r["mode"], r["group_seed"], r["repeat"]) for r in records if r["outcome"] == "error"]
     assert broken == [("boxing", "base", 1, 1)]
@@ -297,7 +316,7 @@ def test_environments_stand_in_configuration_and_journal(uninterrupted):
     assert document["config"]["tracker_facts"] == {"twist2": {"name": "twist2", "drive": "none"}}
     facts = document["config"]["policy_facts"]
     assert facts.pop("code") and facts == {"name": "expert"}
-    hashes = [json.loads(line)["hashes"] for line in (uninterrupted / "episodes.jsonl").read_text().splitlines()]
+    hashes = [line["hashes"] for line in journal(uninterrupted)]
     assert len({h["environment"] for h in hashes}) == len({h["versions"] for h in hashes}) == 1
 
 
@@ -316,49 +335,41 @@ def test_drive_reaches_the_environment(tmp_path):
     assert built == [None, "twist2", "twist2-humanoidarena"]
 
 
-def test_another_environment_is_refused(tmp_path, uninterrupted, capsys):
+def test_another_environment_is_refused(half, uninterrupted, capsys):
     """A resume whose world runs at another physics rate is refused by name before its first episode."""
-    folder = tmp_path / "half"
-    shutil.copytree(uninterrupted, folder)
-    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
-    (folder / "episodes.jsonl").write_text("".join(kept))
+    kept = journal(half)
 
     class Faster(FakeEnv):
         def describe(self):
             return super().describe() | {"physics_dt": 0.005}
 
-    assert main(["resume", str(folder)], factories(env=Faster)) == 2
+    assert main(["resume", str(half)], factories(env=Faster)) == 2
     assert "was run with physics_dt 0.001, now it is 0.005" in capsys.readouterr().err
-    assert (folder / "episodes.jsonl").read_text() == "".join(kept)
+    assert journal(half) == kept
     other = factories(tracker=lambda *_: SimpleNamespace(describe=lambda: {"name": "twist2", "drive": "stiff"}))
-    assert main(["resume", str(folder)], other) == 2
+    assert main(["resume", str(half)], other) == 2
     assert "tracker_facts.twist2.drive was none, now stiff" in capsys.readouterr().err
-    assert main(["resume", str(folder)], factories()) == 0
-    assert tables(folder) == tables(uninterrupted)
+    assert main(["resume", str(half)], factories()) == 0
+    assert tables(half) == tables(uninterrupted)
 
 
-def test_other_versions_are_refused_unless_accepted(tmp_path, uninterrupted, capsys, monkeypatch):
+def test_other_versions_are_refused_unless_accepted(half, uninterrupted, capsys, monkeypatch):
     """Other libraries are named and refused; accepted ones are added to config.json and told apart in the journal."""
-    folder = tmp_path / "half"
-    shutil.copytree(uninterrupted, folder)
-    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
-    (folder / "episodes.jsonl").write_text("".join(kept))
     installed = doctor.versions()
     monkeypatch.setattr(doctor, "versions", lambda: installed | {"tqdm": "9.9"})
-    assert (
-        main(["resume", str(folder), "--worlds", "1", "--task", "football", "boxing", "--seeds", "9"], factories()) == 2
-    )
+    flags = ["--worlds", "1", "--task", "football", "boxing", "--seeds", "9"]
+    assert main(["resume", str(half), *flags], factories()) == 2
     assert "seeds was 0 1 2, now 9" in capsys.readouterr().err  # a progress bar changes nothing
     monkeypatch.setattr(doctor, "versions", lambda: installed | {"torch": "9.9"})
-    assert main(["resume", str(folder)], factories()) == 2
+    assert main(["resume", str(half)], factories()) == 2
     assert f"torch {installed['torch']}, installed is 9.9" in capsys.readouterr().err
     for _ in range(2):
-        assert main(["resume", str(folder), "--accept-versions"], factories()) == 0
-    document = json.loads((folder / "config.json").read_text())
+        assert main(["resume", str(half), "--accept-versions"], factories()) == 0
+    document = json.loads((half / "config.json").read_text())
     assert document["versions"] == installed and [v["torch"] for v in document["later_versions"]] == ["9.9"]
-    hashes = [json.loads(line)["hashes"]["versions"] for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    hashes = [line["hashes"]["versions"] for line in journal(half)]
     assert len(set(hashes[:30])) == len(set(hashes[30:])) == 1 and hashes[0] != hashes[-1]
-    assert tables(folder) == tables(uninterrupted)
+    assert tables(half) == tables(uninterrupted)
 
 
 def test_a_killed_beginning_can_be_begun_again(tmp_path):
@@ -416,10 +427,9 @@ def test_a_run_has_a_status(tmp_path, uninterrupted, capsys):
     assert "The run" not in (folder / "report.html").read_text()
 
 
-def test_a_killed_run_says_so(tmp_path, uninterrupted, capsys):
+def test_a_killed_run_says_so(copied, capsys):
     """A run that was killed after its last episode shows as started; resume, with nothing to play, mends that."""
-    folder = tmp_path / "k"
-    shutil.copytree(uninterrupted, folder)
+    folder = copied
     document = json.loads((folder / "config.json").read_text())
     document["status"] |= {"state": "started", "finished_at": None}
     (folder / "config.json").write_text(json.dumps(document))
@@ -446,19 +456,11 @@ def test_linked_folders_are_refused(tmp_path, uninterrupted, capsys):
     assert list(elsewhere.iterdir()) == []
 
 
-def test_a_journal_of_another_plan_is_refused(tmp_path, uninterrupted, capsys):
+def test_a_journal_of_another_plan_is_refused(copied, capsys):
     """A record that the plan has elsewhere, or not at all, is named by report and resume."""
-    folder = tmp_path / "x"
-    shutil.copytree(uninterrupted, folder)
-    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-    changes = (
-        {"repeat": 4},
-        {"group_seed": 3},
-        {"index": 48},
-        {"task": "pp_box"},
-        {"repeat": 1 + rows[3]["repeat"] % 3},
-    )
-    for change in changes:
+    folder, rows = copied, journal(copied)
+    other = {"repeat": 1 + rows[3]["repeat"] % 3}
+    for change in ({"repeat": 4}, {"group_seed": 3}, {"index": 48}, {"task": "pp_box"}, other):
         changed = [row | change if number == 3 else row for number, row in enumerate(rows)]
         (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in changed))
         for command in ("report", "resume"):
@@ -479,13 +481,9 @@ def test_a_part_that_leaves_is_no_run_that_ended_well(tmp_path, capsys, part):
     assert not (tmp_path / "d").exists()
 
 
-def test_lines_carry_the_hash_of_their_folder(tmp_path, uninterrupted):
+def test_lines_carry_the_hash_of_their_folder(half):
     """Every line, before and after a resume, has the hash of config.json, by which a journal is known as the run's."""
-    folder = tmp_path / "half"
-    shutil.copytree(uninterrupted, folder)
-    kept = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)[:30]
-    (folder / "episodes.jsonl").write_text("".join(kept))
-    assert main(["resume", str(folder)], factories()) == 0
-    document = json.loads((folder / "config.json").read_text())
-    written = [json.loads(line)["hashes"]["config"] for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert main(["resume", str(half)], factories()) == 0
+    document = json.loads((half / "config.json").read_text())
+    written = [line["hashes"]["config"] for line in journal(half)]
     assert len(written) == 48 and set(written) == {document["config_hash"]}

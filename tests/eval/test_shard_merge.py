@@ -377,12 +377,12 @@ def test_a_full_disk_leaves_nothing(copied, monkeypatch, capsys):
 
 
 @pytest.mark.timeout(600)
-def test_a_real_run(tmp_path, kept_worlds):
+def test_a_real_run(tmp_path, quick_worlds):
     """On engine mujoco two shards with other numbers of worlds give one machine's bytes, with strips and films."""
     flags = ["--task", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "3", "--max-steps", "6"]
     flags += ["--policy", "expert", "--tracker", "twist2", "--strip", "--video", "--video-episodes", "1"]
     flags += ["--video-size", "64x48"]
-    real = Factories(env=kept_worlds)
+    real = Factories(env=quick_worlds)
     assert main(["run", *flags, "--worlds", "2", "--out", str(tmp_path / "one")], real) == 0
     for n in (1, 2):
         out = ["--worlds", "1", "--shard", f"{n}/2", "--out", str(tmp_path / f"s{n}")]
@@ -401,11 +401,11 @@ def test_a_real_run(tmp_path, kept_worlds):
 
 
 @pytest.mark.timeout(300)
-def test_recorded_shards(tmp_path, kept_worlds):
+def test_recorded_shards(tmp_path, quick_worlds):
     """Two shards of a recording give the files of one machine's, which the merged folder counts as recorded."""
     flags = "--task boxing --episodes 3 --engine mujoco --size 64x64 --max-steps 4".split()
     for name, more in (("one", "--worlds 2"), ("s1", "--worlds 1 --shard 1/2"), ("s2", "--worlds 1 --shard 2/2")):
-        assert main(["record", *flags, *more.split(), "--out", str(tmp_path / name)], Factories(env=kept_worlds)) == 0
+        assert main(["record", *flags, *more.split(), "--out", str(tmp_path / name)], Factories(env=quick_worlds)) == 0
     merge([tmp_path / "s1", tmp_path / "s2"], tmp_path / "m")
     names = sorted(str(path.relative_to(tmp_path / "one")) for path in (tmp_path / "one" / "episodes").rglob("*.*"))
     assert len(names) == 6

@@ -55,10 +55,10 @@ def test_shards_are_no_part_of_the_identity():
     assert len(hashes) == 1
 
 
-@pytest.mark.parametrize(
-    "value", ["0/4", "5/4", "x", "1/0", "-1/4", "1/-4", "", "1", "/", "1/2/3", "1.0/2", "1/10000", "¹/4", "1 / 4"]
-)
-@pytest.mark.parametrize("command", ["run", "list", "record"])
+BAD = ["0/4", "5/4", "x", "1/0", "-1/4", "1/-4", "", "1", "/", "1/2/3", "1.0/2", "1/10000", "¹/4", "1 / 4"]
+
+
+@pytest.mark.parametrize(("command", "value"), [*(("run", v) for v in BAD), ("list", "5/4"), ("record", "5/4")])
 def test_bad_shards(command, value, capsys, tmp_path, monkeypatch):
     """A value that is not a shard ends with exit code 2 and one line that names flag and value; nothing is written."""
     monkeypatch.chdir(tmp_path)

@@ -1,9 +1,6 @@
-"""Statistics against closed forms and against the paper's tables."""
+"""Statistics against closed forms; against the paper's tables in test_paper_numbers.py."""
 
-import csv
-import itertools
 import math
-from pathlib import Path
 
 import pytest
 from rows import episodes, record
@@ -18,8 +15,6 @@ from arena_newton.eval.statistics.stats import (
     suites,
     wilson,
 )
-
-PAPER = Path(__file__).resolve().parents[2] / ".." / "shared" / "paper" / "in_gmt.csv"
 
 
 def test_cell_counts_and_rates():
@@ -83,51 +78,3 @@ def test_reasons_of_errors_are_counted():
     assert [other["message"][:8] for other in others] == ["ab cab c", "late", "no messa"]
     assert max(len(other["message"]) for other in others) == 400
     assert error_reasons([record(row) for row in rows[10:]]) == []
-
-
-def _seed_counts(mean, std):
-    """Successes of three seeds x 20 repeats that print as the paper's ``mean ± std`` [%]; all that fit."""
-    fits = []
-    for counts in itertools.combinations_with_replacement(range(21), 3):
-        rates = [100 * c / 20 for c in counts]
-        if round(sum(rates) / 3, 1) == mean and round(population_std(rates), 1) == std:
-            fits.append(counts)
-    return fits
-
-
-@pytest.mark.skipif(not PAPER.is_file(), reason="the paper's tables lie next to the checkout only in development")
-def test_suite_averages_match_the_paper():
-    """The paper's suite averages and fall rates come out of its own per-task rows (ACT: 28.33 ± 13.94, 27/420)."""
-    table = {}
-    for row in csv.DictReader(PAPER.open()):
-        table.setdefault((row["tracker"], row["mode"], row["policy"]), {})[row["task"]] = row
-    checked = 0
-    for key, rows in table.items():
-        choices = {
-            task: _seed_counts(float(rows[task]["sr_mean_pct"]), float(rows[task]["sr_std_pct"]))
-            for task in suites()["ALL_AVG"]
-            if task in rows
-        }
-        for suite in ("HOI_AVG", "HSI_AVG"):
-            tasks = suites()[suite]
-            if suite not in rows or any(len(choices.get(task, ())) != 1 for task in tasks):
-                continue
-            records = {task: [record(row) for row in episodes(task, choices[task][0])] for task in tasks}
-            result = pooled(records, tasks)
-            assert 100 * result["sr"] == pytest.approx(float(rows[suite]["sr_mean_pct"]), abs=0.006), (key, suite)
-            assert 100 * result["sr_std"] == pytest.approx(float(rows[suite]["sr_std_pct"]), abs=0.006), (key, suite)
-            checked += 1
-    assert checked > 20
-    act = table["twist2", "base", "act"]
-    tasks = suites()["ALL_AVG"]
-    per_task = [_seed_counts(float(act[t]["sr_mean_pct"]), float(act[t]["sr_std_pct"]))[0] for t in tasks]
-    records = [
-        record(row)
-        for i, (task, counts) in enumerate(zip(tasks, per_task, strict=True))
-        for row in episodes(task, counts, falls=27 if i == 0 else 0, index=60 * i)
-    ]
-    found = {suite["suite"]: suite for suite in aggregate(records)["suites"]}
-    assert 100 * found["HOI_AVG"]["sr"] == pytest.approx(28.33, abs=0.005)
-    assert 100 * found["HOI_AVG"]["sr_std"] == pytest.approx(13.94, abs=0.005)
-    assert (found["ALL_AVG"]["falls"], found["ALL_AVG"]["episodes"]) == (27, 420)
-    assert 100 * found["ALL_AVG"]["afr"] == pytest.approx(float(act["football"]["afr_pct"]), abs=0.005)

@@ -1,5 +1,7 @@
 """A film of successes: what it shows, how long it is, and what it needs."""
 
+import shutil
+
 import av
 import numpy as np
 import pytest
@@ -15,15 +17,15 @@ SIZE = (80, 48)
 """Width and height of the test's videos [px]."""
 
 
-@pytest.fixture
-def folder(tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
     """A run of three tasks whose first success is repeat 1, with a video and a strip of one colour each."""
     rows = []
     for number, task in enumerate(("football", "boxing", "vis_navi")):
         some = episodes(task, (3,), repeats=3, index=60 * number)
         some[0]["outcome"] = "fall"
         rows += [recorded(row, "world", "world strip") for row in some]
-    path = folder_with(tmp_path / "run", rows, 180, seeds=[0])
+    path = folder_with(tmp_path_factory.mktemp("film") / "run", rows, 180, seeds=[0])
     for row in rows:
         value = 200 if row["outcome"] == "fall" else 40 * row["repeat"]
         with VideoWriter(path / row["media"]["world"], *SIZE) as video:
@@ -105,18 +107,19 @@ def test_tiles_are_in_rows():
 def test_bad_input_is_one_line(folder, tmp_path, monkeypatch, capsys, flags, message):
     """A film that cannot be written is one line with code 2, and leaves no file."""
     monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
+    before = sorted(folder.parent.rglob("*"))
     assert main(["film", str(folder), *flags]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and message in error
-    assert sorted(tmp_path.rglob("*")) == before
+    assert sorted(folder.parent.rglob("*")) == before and not list(tmp_path.iterdir())
 
 
 def test_a_recording_that_is_none(folder, tmp_path, capsys):
     """A broken video is named; a run without recordings says which flag makes them."""
-    broken = folder / "videos" / "boxing__base__seed0__repeat1__world.mp4"
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    broken = copy / "videos" / "boxing__base__seed0__repeat1__world.mp4"
     broken.write_bytes(b"no video")
-    assert main(["film", str(folder), "--out", str(tmp_path / "x.webp")]) == 2
+    assert main(["film", str(copy), "--out", str(tmp_path / "x.webp")]) == 2
     assert broken.name in capsys.readouterr().err
     bare = folder_with(tmp_path / "bare", episodes("boxing", (20, 20, 20)), 60)
     assert main(["film", str(bare), "--out", str(tmp_path / "x.webp")]) == 2

@@ -33,12 +33,6 @@ def suite(made_suite):
 
 
 @pytest.fixture(scope="module")
-def cells(suite):
-    """Its cells."""
-    return read_cells([suite])
-
-
-@pytest.fixture(scope="module")
 def tables(cells):
     """Its tables by name."""
     return {table.name: table for table in suite_tables(cells.cells, paper_numbers())}

@@ -252,7 +252,7 @@ def test_datasets_without_a_common_task(made, tmp_path):
         DatasetObservations(other).sample("football", 4, 2)
 
 
-def test_a_checkpoint_goes_through_its_own_pipeline(made, tmp_path, capsys):
+def test_a_checkpoint_goes_through_its_own_pipeline(made, tmp_path, capsys, narrow_resnet):
     """A Diffusion Policy with random weights answers each observation with the noise of that observation alone."""
     checkpoints = pytest.importorskip("tests.policies.checkpoints.made_checkpoints")
     known = checkpoints.facts(family="diffusion")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.readers.label_protocols import V4, V4Decoder
+from arena_newton.data.readers.label_decoder import V4Decoder
+from arena_newton.data.readers.label_protocols import V4
 from arena_newton.policies.base import Chunk, Policy
 from arena_newton.policies.label_reader import V4Policy, measured_yaw
 from arena_newton.robot import g1

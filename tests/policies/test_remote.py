@@ -1,15 +1,14 @@
 """The client of the original's HTTP protocol: what it sends, what it accepts, how long it waits."""
 
 import base64
-import json
 import socket
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 import torch
+from json_server import JsonHandler, JsonServer
 
 from arena_newton import policies
 from arena_newton.errors import InputError
@@ -26,14 +25,12 @@ def good_action(tag: float = 0.0) -> list[float]:
     return action
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(JsonHandler):
     """Answers as the original's server; `server.behave` decides by the first number of the state."""
-
-    protocol_version = "HTTP/1.1"
 
     def do_POST(self):  # noqa: N802 (the name that http.server calls)
         server = self.server
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        body = self.asked()
         with server.lock:
             server.seen.append((self.path, body, self.client_address))
             server.tokens.append(self.headers["Authorization"])
@@ -83,7 +80,7 @@ class Handler(BaseHTTPRequestHandler):
             self.answer(500, {"error": "CUDA out of\nmemory"})
             return
         if kind == "text":
-            self.answer(200, None, raw=b"<html>hello</html>")
+            self.answer(200, b"<html>hello</html>")
             return
         rows = [good_action(tag) for _ in range(CHUNK)]
         if kind == "39":
@@ -103,38 +100,22 @@ class Handler(BaseHTTPRequestHandler):
             reply = {"action": rows[0]}
         self.answer(200, reply)
 
-    def answer(self, status, content, raw=None):
-        data = json.dumps(content).encode() if raw is None else raw
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
+    def answer(self, status, content):
+        super().answer(status, content)
         if self.server.drops:  # as servers do that keep no idle connection
             self.close_connection = True
 
     def do_GET(self):  # noqa: N802 (the name that http.server calls)
         self.answer(502 if "gateway" in self.server.behave.values() else 404, {"error": "no such route"})
 
-    def log_message(self, *_):
-        pass
-
 
 @pytest.fixture
 def server():
-    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    running.daemon_threads = True
-    running.lock, running.release = threading.Lock(), threading.Event()
-    running.seen, running.behave, running.count, running.count_at_start = [], {}, 0, 0
-    running.tokens, running.says, running.drops = [], {}, False
-    thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
-    thread.start()
-    running.url = f"http://127.0.0.1:{running.server_port}"
+    given = {"seen": [], "behave": {}, "count": 0, "count_at_start": 0, "tokens": [], "says": {}, "drops": False}
+    running = JsonServer(Handler, release=threading.Event(), **given)
     yield running
     running.release.set()
-    if thread.is_alive():
-        running.shutdown()
-    running.server_close()
+    running.close()
 
 
 @pytest.fixture
@@ -224,11 +205,11 @@ def test_bad_reply_ends_one_world(server, policy, kind, text):
 def test_deadline(server, kind, sequential):
     """A server that hangs or drips bytes costs one deadline and one world."""
     server.behave = {1.0: kind}
-    policy = RemotePolicy(server.url, timeout=0.5, retries=2, backoff=0.01, sequential=sequential)
+    policy = RemotePolicy(server.url, timeout=0.3, retries=2, backoff=0.01, sequential=sequential)
     start = time.monotonic()
     chunk = policy.act(observation(3))
     assert time.monotonic() - start < 3.0
-    assert set(chunk.errors) == {1} and "no reply within 0.5 s" in chunk.errors[1]
+    assert set(chunk.errors) == {1} and "no reply within 0.3 s" in chunk.errors[1]
     assert chunk.actions[2, 0, 38] == 2.0
     policy.close()
 
@@ -353,16 +334,16 @@ def test_gateway_without_a_server_stops_the_run(server, policy):
 def test_server_that_hangs_stops_the_run(call):
     """A server that takes connections and never answers costs two deadlines, however many worlds wait."""
     with socket.create_server(("127.0.0.1", 0), backlog=64) as listening:
-        policy = RemotePolicy(f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=0.4, retries=3, backoff=0.01)
+        policy = RemotePolicy(f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=0.2, retries=3, backoff=0.01)
         start = time.monotonic()
-        with pytest.raises(InputError if call == "check" else PolicyUnavailable, match="no reply within 0.4 s"):
+        with pytest.raises(InputError if call == "check" else PolicyUnavailable, match="no reply within 0.2 s"):
             if call == "act":
                 policy.act(observation(20))
             elif call == "reset":
                 policy.reset(range(20), ["Isaac-Football"] * 20)
             else:
                 policy.check()
-        assert time.monotonic() - start < 4.0  # 20 deadlines would be 8 s
+        assert time.monotonic() - start < 3.0  # 20 deadlines would be 4 s
         policy.close()
 
 
@@ -537,7 +518,7 @@ def test_https(server, certificate):
         policy.check()
     policy.close()
     server.behave = {1.0: "slow"}
-    policy = RemotePolicy(url, timeout=0.5, retries=0, verify_ssl=False)
+    policy = RemotePolicy(url, timeout=0.3, retries=0, verify_ssl=False)
     policy.check()
     for _ in range(2):
         start = time.monotonic()

@@ -1,14 +1,14 @@
 """Statements of docs/policies.md hold: its tables, its server, its policy in Python."""
 
-import json
 import re
 import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from json_server import JsonHandler, JsonServer
 
 from arena_newton import policies, tasks
 from arena_newton.env import STAND_ACTION
@@ -99,24 +99,17 @@ def test_request_tables():
     """Requests have the keys of the tables, and no others."""
     seen = {}
 
-    class Listen(BaseHTTPRequestHandler):
+    class Listen(JsonHandler):
         def do_POST(self):  # noqa: N802 (the name that http.server calls)
-            seen[self.path] = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(json.dumps({"action": STAND_ACTION.tolist()}).encode())
+            seen[self.path] = self.asked()
+            self.answer(200, {"action": STAND_ACTION.tolist()})
 
-        def log_message(self, *_):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Listen)
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
-    policy = RemotePolicy(f"http://127.0.0.1:{server.server_port}", timeout=5.0)
+    server = JsonServer(Listen)
+    policy = RemotePolicy(server.url, timeout=5.0)
     policy.reset([3], ["Isaac-Boxing"])
     assert policy.act(observation(1)).errors == {}
     policy.close()
-    server.shutdown()
-    server.server_close()
+    server.close()
     for route, body in seen.items():
         assert sorted(row[0] for row in table(f"`{route}`")) == sorted(body)
     picture = seen["/infer"]["observation"]["images"]["front"]

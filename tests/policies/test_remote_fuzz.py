@@ -19,7 +19,7 @@ from arena_newton.robot.canonical import validate_action
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
 BATCH = 16
-TIMEOUT = 2.5
+TIMEOUT = 1.5
 ACTION = [0.0, 0.0, 0.8, 1.0, 0.0, 0.0, 1.0, *[0.0] * 33]
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
 BODY = json.dumps({"action_chunk": [ACTION] * 4}).encode()

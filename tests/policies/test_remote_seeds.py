@@ -1,13 +1,11 @@
 """Stochastic policy servers: what of their results is the same for any number of worlds, and what is not."""
 
-import json
 import random
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from json_server import JsonHandler, JsonServer
 
 from arena_newton import trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
@@ -20,14 +18,12 @@ STEPS = 10
 SEEDS = tuple(1000 + 7 * i for i in range(20))
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(JsonHandler):
     """A policy that looks at the state and adds noise, from the request's seed and step or from one generator."""
-
-    protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
 
     def do_POST(self):  # noqa: N802 (the name that http.server calls)
         server = self.server
-        asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        asked = self.asked()
         with server.lock:
             server.count += 1
             if server.drop_every and server.count % server.drop_every == 0:
@@ -43,26 +39,14 @@ class Handler(BaseHTTPRequestHandler):
                 actions[:, 9:38] += 0.05 * np.sin(10.0 * state[6:35]) + 0.05 * rng.standard_normal((CHUNK, 29))
                 reply = {"action_chunk": actions.tolist()}
                 server.seen[asked["seed"], asked["step"]] = tuple(asked["observation"]["state"])
-        data = json.dumps(reply).encode()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def log_message(self, *_):
-        pass
+        self.answer(200, reply)
 
 
 @pytest.fixture
 def server():
-    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    running.daemon_threads = True
-    running.lock, running.rng = threading.Lock(), np.random.default_rng(0)
-    running.seeded, running.seen, running.count, running.drop_every = True, {}, 0, 0
-    threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+    running = JsonServer(Handler, rng=np.random.default_rng(0), seeded=True, seen={}, count=0, drop_every=0)
     yield running
-    running.shutdown()
-    running.server_close()
+    running.close()
 
 
 def observe(states, asks):
@@ -101,7 +85,7 @@ def play(policy, seeds, worlds):
 def run(server, worlds, seeds=SEEDS, loop=play, **options):
     """Endings of the episodes by seed, and all that the server saw, by seed and step, to the last bit."""
     server.seen = {}
-    policy = RemotePolicy(f"http://127.0.0.1:{server.server_port}", timeout=20.0, retries=3, backoff=0.01, **options)
+    policy = RemotePolicy(server.url, timeout=20.0, retries=3, backoff=0.01, **options)
     policy.needs_image = False
     policy.check()
     ends = loop(policy, seeds, worlds)

@@ -14,7 +14,8 @@ import numpy as np
 
 from arena_newton import tasks
 from arena_newton.data.readers.dataset_files import DatasetFiles
-from arena_newton.data.readers.label_protocols import LABELS, decode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
+from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH

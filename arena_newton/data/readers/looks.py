@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arena_newton.data.readers.dataset_files import read_json
 from arena_newton.errors import InputError
+from arena_newton.files.stored_json import read_object
 
 __all__ = ["FIRST_SHAPE", "LOOKS_FOLDER", "MOST_LIGHTS", "MOST_SHAPES", "SCHEMA", "DatasetLooks", "Looks"]
 __all__ += ["dataset_looks", "described_looks", "film_path"]
@@ -137,7 +137,7 @@ def dataset_looks(root: Path, episodes: int) -> list[DatasetLooks | None]:
     path = root / LOOKS_FOLDER / "looks.json"
     if not path.parent.is_dir():
         return [None] * episodes
-    content = read_json(path)
+    content = read_object(path, 64 << 20)
     listed = content.get("episodes")
     if content.get("schema") != SCHEMA:
         raise InputError(f"{path}: schema is {str(content.get('schema'))[:40]!r}, expected {SCHEMA}")

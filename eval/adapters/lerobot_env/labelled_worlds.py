@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from arena_newton.data.readers.label_protocols import V4Decoder
+from arena_newton.data.readers.label_decoder import V4Decoder
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.gym import ArenaVectorEnv, Info, Observations
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds

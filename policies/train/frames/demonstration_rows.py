@@ -12,7 +12,8 @@ import numpy as np
 
 from arena_newton.data.datasets.row_statistics import aggregated, row_statistics
 from arena_newton.data.readers.dataset_files import DatasetFiles, read_json
-from arena_newton.data.readers.label_protocols import LABELS, action_names, decode_v4, encode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
+from arena_newton.data.readers.label_protocols import LABELS, action_names, encode_v4
 from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.data.readers.looks import LOOKS_FOLDER
 from arena_newton.errors import InputError

@@ -31,7 +31,7 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 if TYPE_CHECKING:
     from arena_newton.policies.train.frames.look_store import LookStore
 
-__all__ = ["FrameStore", "free_memory", "load_frames", "made_frames", "made_statistics", "needed_memory"]
+__all__ = ["FrameStore", "assembled", "check_memory", "free_memory", "load_frames", "made_statistics", "needed_memory"]
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
@@ -314,39 +314,6 @@ def assembled(
         bottom=bottom,
         every=every,
     )
-
-
-def made_frames(
-    frames: int, size: int, device: torch.device, *, seed: int = 0, length: int = 500, network: int = 0
-) -> FrameStore:
-    """Rows of noise, for measurements without a dataset.
-
-    Args:
-        frames: Number of rows.
-        size: Height and width of a picture [px]; an eighth of the rows above and below is black, as in a padded one.
-        device: Where they are wanted.
-        seed: Of the noise.
-        length: Rows of an episode.
-        network: Memory that the network needs beside them [bytes].
-
-    Raises:
-        InputError: They do not fit.
-    """
-    band = size // 8
-    check_memory(frames, frames, size - 2 * band, size, device, network)
-    generator = torch.Generator(device).manual_seed(seed)
-    pictures = torch.empty((frames, size - 2 * band, size, 3), dtype=torch.uint8, device=device)
-    for start in range(0, frames, length):
-        part = pictures[start : start + length]
-        part.copy_(torch.randint(0, 256, part.shape, generator=generator, dtype=torch.uint8, device=device))
-    rng = np.random.default_rng(seed)
-    episodes = []
-    for start in range(0, frames, length):
-        rows = min(length, frames - start)
-        states = rng.normal(size=(rows, STATE_WIDTH)).astype(np.float32)
-        actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
-        episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
-    return assembled(episodes, pictures, [False] * len(episodes), band, band)
 
 
 def made_statistics() -> dict[str, dict[str, torch.Tensor]]:

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton.data.readers.label_protocols import (
-    LABELS,
-    V4,
-    V4Decoder,
-    action_names,
-    decode_v4,
-    encode_v4,
-    protocol,
-)
+from arena_newton.data.readers.label_decoder import V4Decoder, decode_v4
+from arena_newton.data.readers.label_protocols import LABELS, V4, action_names, encode_v4, protocol
 from arena_newton.data.recording.layouts import described_protocol
 from arena_newton.errors import InputError
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, STAND_ACTION

@@ -335,7 +335,7 @@ def test_damaged_files_raise_nothing_else(folder, mutants):
     draw, refused = random.Random(3), 0
     (folder / "train_config.json").write_text(json.dumps({"dataset": {"image_transforms": TRANSFORMS}}))
     sound = {path: path.read_bytes() for path in sorted(folder.glob("*.json"))}
-    for _ in range(2 * mutants):
+    for _ in range(mutants):
         path = draw.choice(list(sound))
         path.write_bytes(damaged(sound[path], draw, text=True))
         try:
@@ -343,7 +343,7 @@ def test_damaged_files_raise_nothing_else(folder, mutants):
         except InputError:
             refused += 1
         path.write_bytes(sound[path])
-    assert refused > mutants // 2
+    assert refused > mutants // 4
 
 
 def test_a_name_of_the_hub_that_is_not_here(tmp_path, monkeypatch, capsys):

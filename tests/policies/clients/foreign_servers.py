@@ -9,12 +9,12 @@ import io
 import json
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import msgpack
 import numpy as np
 import torch
 import zmq
+from json_server import JsonHandler, JsonServer
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
@@ -403,44 +403,26 @@ class HttpServer(Recorder):
         super().__init__()
         outer = self
 
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
-
+        class Handler(JsonHandler):
             def do_GET(self):  # noqa: N802 (the name that http.server calls)
-                self.reply(200 if declared else 404, declared.to_json() if declared else {"error": "no such route"})
+                self.answer(200 if declared else 404, declared.to_json() if declared else {"error": "no such route"})
 
             def do_POST(self):  # noqa: N802 (the name that http.server calls)
-                asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                asked = self.asked()
                 if self.path == "/reset":
-                    self.reply(200, {"ok": True, "seeded": True, "policy": "noise 1"})
+                    self.answer(200, {"ok": True, "seeded": True, "policy": "noise 1"})
                     return
                 front = asked["observation"]["images"]["front"]
                 image = np.frombuffer(base64.b64decode(front["data_b64"]), np.uint8).reshape(front["shape"])
                 outer.note("query", image.shape)
                 if outer.behave.get("any") == "unknown":
-                    self.reply(409, {"error": "unknown episode"})
+                    self.answer(409, {"error": "unknown episode"})
                     return
                 state = np.array(asked["observation"]["state"], np.float32)
-                self.reply(200, {"action_chunk": answer(state, image, asked["seed"], asked["step"]).tolist()})
+                self.answer(200, {"action_chunk": answer(state, image, asked["seed"], asked["step"]).tolist()})
 
-            def reply(self, status, content):
-                data = json.dumps(content).encode()
-                self.send_response(status)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                self.wfile.write(data)
-
-            def log_message(self, *_):
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
-        threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
-
-    def close(self):
-        self.server.shutdown()
-        self.server.server_close()
+        server = JsonServer(Handler)
+        self.url, self.close = server.url, server.close
 
 
 def declared_servers():

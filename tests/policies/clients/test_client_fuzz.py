@@ -101,7 +101,7 @@ def test_broken_replies_are_an_error_of_their_world(protocol, mutants):
         good = vla_eval_codec.pack_action(ROWS, 3, 1.0)
         replies = [*broken(good, mutants, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
     server = Answering(protocol, list(replies))
-    policy = policies.get(f"remote:{server.url}", timeout=3.0, retries=0, backoff=0.01)
+    policy = policies.get(f"remote:{server.url}", timeout=1.0, retries=0, backoff=0.01)
     policy.check()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     drive(server, policy, len(replies))

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from foreign_servers import SIZE, NoisePolicy, declared_servers, observation
 
 from arena_newton import policies
@@ -22,9 +21,7 @@ class OwnServer:
     """This package's server with the same policy."""
 
     def __init__(self, protocol, port=0):
-        self.server = PolicyServer(
-            NoisePolicy(), max_batch_size=8, max_wait=0.01, max_sessions=16, device=torch.device("cpu")
-        )
+        self.server = PolicyServer(NoisePolicy(), max_batch_size=8, max_wait=0.002, max_sessions=16)
         self.server.start("football")
         options = ServeOptions(policy="stand", protocol=protocol, port=port)
         self.endpoint = open_endpoint(self.server, options, ConnectionGuard(16))

@@ -3,12 +3,11 @@
 import base64
 import json
 import random
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 from foreign_servers import observation
+from json_server import JsonHandler, JsonServer
 
 from arena_newton import policies
 from arena_newton.errors import InputError
@@ -45,32 +44,18 @@ class SimpleServer:
             lambda asked: {"action": coded(rows(asked["state"]["states"][0])), "err": 0.0, "traj_image": []}
         )
 
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version, disable_nagle_algorithm = "HTTP/1.1", True
-
+        class Handler(JsonHandler):
             def do_POST(self):  # noqa: N802
-                asked = decoded(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+                asked = decoded(self.asked())
                 outer.seen.append((self.path, asked))
                 reply = outer.answer(asked) if self.path == "/act" else (404, b"{}")
-                status, body = reply if isinstance(reply, tuple) else (200, reply)
-                self.reply(status, body if isinstance(body, bytes) else json.dumps(body).encode())
+                self.answer(*reply if isinstance(reply, tuple) else (200, reply))
 
             def do_GET(self):  # noqa: N802
-                self.reply(200 if self.path == "/health" else 404, b'{"detail": "Not Found"}')
+                self.answer(200 if self.path == "/health" else 404, {"detail": "Not Found"})
 
-            def reply(self, status, body):
-                self.send_response(status)
-                self.send_header("Content-Length", str(len(body)))
-                self.end_headers()
-                self.wfile.write(body)
-
-            def log_message(self, *given):
-                pass
-
-        self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.http.daemon_threads = True
-        threading.Thread(target=self.http.serve_forever, args=[0.05], daemon=True).start()
-        self.url = f"simple://127.0.0.1:{self.http.server_address[1]}"
+        self.http = JsonServer(Handler)
+        self.url = self.http.url.replace("http", "simple")
 
 
 @pytest.fixture
@@ -84,8 +69,7 @@ def simple():
 
     yield make
     for one in made:
-        one.http.shutdown()
-        one.http.server_close()
+        one.http.close()
 
 
 def client(server):

@@ -380,13 +380,13 @@ def test_handshake_comes_back():
     [
         (3, "metadata is int"),
         ({"arena": 2}, "handshake has version 2, expected 1"),
-        ({"arena": 1, "labels": "v5"}, "declares labels as 'v5'"),
-        ({"arena": 1, "action_names": [1]}, "declares action_names"),
-        ({"arena": 1, "chunk_length": -1}, "declares chunk_length"),
-        ({"arena": 1, "rate_hz": 0}, "declares rate_hz"),
-        ({"arena": 1, "picture": {"width": 224}}, "declares picture"),
-        ({"arena": 1, "realign": 2}, "declares realign"),
-        ({"arena": 1, "batched": 1}, "declares batched"),
+        ({"arena": 1, "labels": "v5"}, "declares: labels is"),
+        ({"arena": 1, "action_names": [1]}, "declares: action_names is"),
+        ({"arena": 1, "chunk_length": -1}, "declares: chunk_length is"),
+        ({"arena": 1, "rate_hz": 0}, "declares: rate_hz is"),
+        ({"arena": 1, "picture": {"width": 224}}, "declares: picture is"),
+        ({"arena": 1, "realign": 2}, "declares: realign is"),
+        ({"arena": 1, "batched": 1}, "declares: batched is"),
     ],
 )
 def test_damaged_handshakes(content, message):

@@ -54,7 +54,7 @@ def test_a_connection_that_cannot_be_taken_ends_no_endpoint(served, protocol):
                 while True:
                     filled.enter_context(open(os.devnull))
             client.connect(("127.0.0.1", one.port))
-            time.sleep(0.3)
+            time.sleep(0.1)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert one.http("GET", "/healthz") == (200, b"OK\n")
@@ -110,7 +110,7 @@ def test_strangers_take_no_room(served, protocol):
     """Connections that have not shown a token do not count; beyond a number they are closed unread."""
     one = served(Remembers(), protocol, token="abc", connections=2)
     silent = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(10)]
-    time.sleep(0.2)
+    time.sleep(0.05)
     if protocol == "arena":
         with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
             client.sendall(RESET)

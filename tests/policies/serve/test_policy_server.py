@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from served_policies import Fails, Remembers, TurnsV4, query, state, together
 
-from arena_newton.data.readers.label_protocols import decode_v4
+from arena_newton.data.readers.label_decoder import decode_v4
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.base import Chunk, Policy
@@ -277,7 +277,7 @@ def test_pictures_are_fitted(made):
     server = made(Remembers(sees=True))
     answer = server.query("a", Query(state(), native, "boxing", seed=1, step=0)).actions
     assert answer[0, 12] == pytest.approx(0.001 * padded.mean(), rel=1e-4)
-    with pytest.raises(Refused, match="looks at pictures, the message holds none"):
+    with pytest.raises(Refused, match="needs a picture, the message holds none"):
         server.query("a", query(step=4))
 
 

@@ -14,6 +14,7 @@ from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
 from arena_newton.policies.train import network_compiler, training
 from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
+from arena_newton.policies.train.families.act_family import ActModel
 from arena_newton.policies.train.policy_options import UNCOMPILED, PolicyTrainOptions
 from arena_newton.policies.train.training import train
 from tests.policies.train import narrow_network
@@ -137,6 +138,8 @@ def test_a_compiler_that_fails_is_one_error(dataset, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", str(broken))
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, str(broken)))
     torch.compiler.reset()
+    # One layer is enough for a complaint.
+    monkeypatch.setattr(ActModel, "compiled_parts", lambda self: [self.policy.model.action_head])
     # A cache that other processes fill could spare this one the compiler, and a pool of processes be slow to start.
     own = fresh_cache(dir=str(tmp_path)), torch._inductor.config.patch(compile_threads=1)
     with own[0], own[1], pytest.raises(ArenaError, match="--compile: the network could not be compiled") as error:

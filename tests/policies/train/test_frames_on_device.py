@@ -21,9 +21,10 @@ from arena_newton.policies.train.frames import frame_store
 from arena_newton.policies.train.frames.augmentation import gathered_pictures
 from arena_newton.policies.train.frames.batching import BalancedOrder, BatchMaker, RowOrder, step_seed
 from arena_newton.policies.train.frames.demonstration_rows import read_rows, statistics
-from arena_newton.policies.train.frames.frame_store import load_frames, made_frames
+from arena_newton.policies.train.frames.frame_store import load_frames
 from arena_newton.policies.train.network_memory import SIZES, network_bytes
 from arena_newton.policies.train.training import camera_fit
+from benchmarks.made_frames import made_frames
 from tests.fuzz.mutants import damaged
 from tests.policies.train.made_stats import made_stats
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset

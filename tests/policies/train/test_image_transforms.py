@@ -10,7 +10,7 @@ from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames import augmentation
 from arena_newton.policies.train.frames.augmentation import gathered_pictures
 from arena_newton.policies.train.frames.batching import BatchMaker
-from arena_newton.policies.train.frames.frame_store import made_frames, made_statistics
+from arena_newton.policies.train.frames.frame_store import made_statistics
 from arena_newton.policies.train.frames.image_transforms import (
     CHOSEN,
     RANGES,
@@ -20,6 +20,7 @@ from arena_newton.policies.train.frames.image_transforms import (
     transformed,
 )
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
+from benchmarks.made_frames import made_frames
 from tests.policies.train import narrow_network
 
 CPU = torch.device("cpu")

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -12,6 +13,7 @@ import socket
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -19,7 +21,9 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import (
     training,
@@ -30,17 +34,21 @@ from arena_newton.policies.train import (
 from arena_newton.policies.train.__main__ import main
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.batching import BatchMaker
-from arena_newton.policies.train.frames.frame_store import made_frames
+from arena_newton.policies.train.frames.demonstration_rows import read_rows
+from arena_newton.policies.train.frames.frame_store import load_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.training import chosen_recipe, train
+from arena_newton.policies.train.training import train
+from benchmarks.made_frames import made_frames
 from tests.children import Child
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network
 from tests.policies.train.made_stats import made_stats
 from tests.policies.train.small_dataset import info, make_dataset, padded
+from tests.policies.train.stock_lerobot import opened, raw_observation
 
 STEPS = 8
+FRONT = "observation.images.front"
 
 
 @pytest.fixture(autouse=True)
@@ -282,7 +290,7 @@ def test_processes_that_differ_are_refused(monkeypatch):
         trainer.check_agreement()
 
 
-def plain_trainer(monkeypatch, batch, rank=0, ranks=1, **more):
+def plain_trainer(monkeypatch, batch, rank=0, ranks=1, store=None, **more):
     """A trainer whose loss is a mean over the batch and draws nothing: no dropout, latent, augmentation or padding."""
     network = {"dropout": 0.0, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
     settings = recipe("act", "small", network=network, chunk=1, horizon=1, batch_norm=False)
@@ -291,7 +299,8 @@ def plain_trainer(monkeypatch, batch, rank=0, ranks=1, **more):
     zeros, ones = torch.zeros(64), torch.ones(64)
     stats = {"observation.state": {"mean": zeros, "std": ones}, "action": {"mean": zeros[:40], "std": ones[:40]}}
     model = families.build(settings, stats, "cpu")
-    batches = BatchMaker(made_frames(40, 64, torch.device("cpu")), model.normalise, model.samples)
+    store = made_frames(40, 64, torch.device("cpu")) if store is None else store
+    batches = BatchMaker(store, model.normalise, model.samples)
     return PolicyTrainer(model, batches, settings, rank=rank, ranks=ranks)
 
 
@@ -383,49 +392,88 @@ def test_a_folder_belongs_to_one_process(dataset, whole, tmp_path, monkeypatch):
         train(options(dataset, out, steps=1))
 
 
-@pytest.mark.parametrize(
-    ("flags", "expected"),
-    [
-        ({"policy": "act", "recipe": "paper", "labels": "v4"}, ("v4", 0.002, 1e-5, 1e-5)),
-        ({"policy": "act", "recipe": "fast", "labels": "v4"}, ("v4", 0.002, 1e-4, 1e-4)),
-        ({"policy": "act", "recipe": "fast", "labels": "v3.1"}, ("v3.1", 0.0, 1e-4, 1e-4)),
-        ({"policy": "flow", "recipe": "paper", "lr": 1e-3}, ("v3.1", 0.0, 1e-3, 1e-4)),
-    ],
-)
-def test_flags_change_what_belongs_together(flags, expected):
-    """--labels v4 has a realign with every recipe, and --lr keeps the ratio of the encoder's learning rate."""
-    found = chosen_recipe(PolicyTrainOptions(**flags))
-    labels, *rates = expected
-    assert found.labels == labels
-    assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
+@pytest.fixture(scope="module")
+def pairs(dataset, tmp_path_factory):
+    """Datasets of Boxing through both trackers and of Football through one."""
+    folder = tmp_path_factory.mktemp("pairs")
+    sonic = make_dataset(folder, lengths=(24, 22), tracker="sonic")
+    return dataset, sonic, make_dataset(folder, lengths=(22, 23), task="football", labels="v4")
 
 
-@pytest.mark.parametrize(
-    ("flags", "rates"),
-    [
-        ({"policy": "flow", "weights": "a/clip"}, (1e-4, 2e-6)),
-        ({"policy": "flow", "weights": "a/clip", "lr": 5e-5}, (5e-5, 1e-6)),
-        ({"policy": "flow", "weights": "a/clip", "recipe": "paper"}, (2e-5, 2e-6)),
-        ({"policy": "flow"}, (1e-4, 1e-4)),
-        ({"policy": "act", "weights": "a/resnet"}, (1e-4, 1e-4)),
-        ({"policy": "diffusion", "weights": "a/resnet"}, (1e-4, 1e-4)),
-        ({"policy": "pi05", "weights": "a/base"}, (2.5e-5, 2.5e-5)),
-    ],
-)
-def test_a_pretrained_encoder_is_tuned_as_slowly_as_the_papers(flags, rates):
-    """With --weights CLIP has the paper's learning rate, 2e-6; new weights, and families without one, the recipe's."""
-    found = chosen_recipe(PolicyTrainOptions(**flags))
-    assert [found.lr, found.lr_backbone] == pytest.approx(rates)
+def test_many_tasks_through_several_trackers(pairs, tmp_path, monkeypatch, capsys):
+    """The vector names task and tracker, fractions and losses are of each pair, a resumed training has the same bits.
+
+    What the training began with counts on a resume, whatever the recipe of that name has become.
+    """
+    given = {"dataset": pairs, "balance": "task", "task_weights": ("football=3",), "task_vector": True, "steps": 6}
+    given |= {"hold_out": 1, "hold_out_every": 3, "log_every": 3, "batch_size": 8, "quiet": False}
+    whole = train(options(None, tmp_path / "whole", **given))
+    printed = capsys.readouterr().out
+    facts = CheckpointFacts.read(whole)
+    assert (facts.task_vector, facts.tracker_vector) == (("boxing", "football"), ("sonic", "twist2"))
+    assert PreTrainedConfig.from_pretrained(whole).input_features["observation.environment_state"].shape == (5,)
+    names = ("boxing_sonic", "boxing_twist2", "football_twist2")
+    for row in rows(tmp_path / "whole"):
+        assert all(float(row[f"held_out_loss_{name}"]) > 0.0 for name in names) and float(row["loss_football_twist2"])
+    found = {name: float(re.search(rf"^{name}: (\S+) % of the samples", printed, re.M)[1]) for name in names}
+    assert found["football_twist2"] > 40.0 > max(found["boxing_sonic"], found["boxing_twist2"])
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt(patch, 4, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(options(None, out, **given))
+    monkeypatch.setattr(training, "chosen_recipe", lambda options: pytest.fail("takes another recipe"))
+    train(PolicyTrainOptions(resume=out, quiet=True))
+    assert same(weights(out), weights(tmp_path / "whole"))
 
 
-def test_two_datasets_and_a_task_vector(dataset, tmp_path):
-    """Merged training: the vector has a number per task, and LeRobot's network takes it as a token."""
-    other = make_dataset(tmp_path, lengths=(22,), task="football", labels="v4")
-    folder = train(options(dataset, tmp_path / "run", dataset=(dataset, other), task_vector=True, steps=2))
-    facts = CheckpointFacts.read(folder)
-    assert facts.task_vector == facts.tasks == ("boxing", "football") and len(facts.datasets) == 2
-    features = PreTrainedConfig.from_pretrained(folder).input_features
-    assert features["observation.environment_state"].shape == (2,)
+def test_a_policy_that_is_not_given_its_tracker(pairs, tmp_path):
+    """--no-tracker-vector leaves it out, as trainings did before there was the flag, which go on without."""
+    out = tmp_path / "run"
+    facts = CheckpointFacts.read(
+        train(options(None, out, dataset=pairs[:2], task_vector=True, tracker_vector=False, steps=1))
+    )
+    assert (facts.task_vector, facts.tracker_vector, facts.vector_width) == (("boxing",), (), 1)
+    progress = out / "checkpoints" / "last" / "training_state" / "arena_training.json"
+    content = json.loads(progress.read_text())
+    del content["options"]["tracker_vector"]
+    progress.write_text(json.dumps(content))
+    assert CheckpointFacts.read(train(PolicyTrainOptions(resume=out, steps=2, quiet=True))).tracker_vector == ()
+
+
+def test_losses_of_pairs_sum_to_the_whole(pairs, monkeypatch):
+    """Weighed by their samples, losses of pairs are the loss of the step, and held-out ones that of all rows."""
+    store = load_frames([read_rows(one, "v4") for one in pairs], torch.device("cpu"), hold_out=1, jobs=1)
+    trainer = plain_trainer(monkeypatch, 16, store=store)
+    for _ in range(2):
+        before = dict(trainer.drawn)
+        trainer.advance()
+        losses = trainer.pair_losses()
+        counts = {name: trainer.drawn[name] - before[name] for name in losses}
+        assert sum(counts.values()) == 16 and len(losses) > 1
+        assert sum(counts[name] * losses[name] for name in losses) / 16 == pytest.approx(float(trainer.loss))
+    held, of_pairs = trainer.held_out_losses()
+    taken = np.linspace(0, len(trainer.held) - 1, len(trainer.held) // 16 * 16).round().astype(int)
+    counts = np.bincount(store.pair[trainer.held[taken]], minlength=3)
+    assert sum(counts * list(of_pairs.values())) / sum(counts) == pytest.approx(held)
+
+
+def test_a_network_without_the_pad(dataset, tmp_path, monkeypatch):
+    """Black bars of a dataset are cut off, and the policy wants the camera's own 4:3; pictures without bars stay."""
+    monkeypatch.setattr(training, "chosen_recipe", lambda options: recipe("act", "small", cut_pad=True))
+    folder = train(options(dataset, tmp_path / "cut", steps=1))
+    assert LeRobotPolicy(folder).camera == CameraConfig(width=64, height=48, fit="native")
+    policy, before, _ = opened(folder)
+    assert (
+        policy.predict_action_chunk(before(raw_observation(rows=1) | {FRONT: torch.rand(1, 3, 48, 64)}))
+        .isfinite()
+        .all()
+    )
+    bright = make_dataset(
+        tmp_path, lengths=(22,), pictures=lambda n, size, seed: np.full((n, size, size, 3), 90, np.uint8)
+    )
+    facts = CheckpointFacts.read(train(options(bright, tmp_path / "whole", steps=1)))
+    assert (facts.width, facts.height, facts.fit) == (64, 64, "native")
 
 
 def test_a_loss_that_is_not_finite_ends_the_training(dataset, tmp_path, monkeypatch):
@@ -454,6 +502,11 @@ BAD = [
     (["--hold-out", "9"], "--hold-out 9: "),
     (["--recipe", "fast"], "pictures of 64x64 pixels, recipe act/fast takes 224x224: record with --size 224x224"),
     (["--resume", "nowhere"], "--resume nowhere: no such folder"),
+    (["--balance", "even"], "--balance even: unknown, choose from picture, task"),
+    (["--task-weights", "boxing=2"], "--task-weights: weigh the draw of --balance task, which is not given"),
+    (["--balance", "task", "--task-weights", "boxing=0"], "--task-weights boxing=0: expected a task and a positive"),
+    (["--balance", "task", "--task-weights", "football=2"], "--task-weights football: the datasets have boxing"),
+    (["--picture-every", "0"], "--picture-every 0: expected a number from 1"),
     (["--steps", "many"], "--steps: cannot read many"),
     (["--speed", "1"], "--speed: unknown argument"),
 ]

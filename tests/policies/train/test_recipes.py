@@ -20,6 +20,8 @@ from lerobot.scripts import lerobot_train
 from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, TrainingRecipe, paper_file, recipe
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.training import chosen_recipe
 
 TABLE = {
     "act": {"lr": 1.0e-5, "chunk": 20, "horizon": 20, "precision": "float32"},
@@ -185,6 +187,41 @@ def test_overrides_are_put_over_the_recipe():
     found = recipe("act", "fast", steps=7, network={"dropout": 0.0})
     assert (found.steps, found.network["dropout"], found.network["dim_model"]) == (7, 0.0, 512)
     assert isinstance(found, TrainingRecipe) and recipe("act", "fast").steps == 15_000
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"policy": "act", "recipe": "paper", "labels": "v4"}, ("v4", 0.002, 1e-5, 1e-5)),
+        ({"policy": "act", "recipe": "fast", "labels": "v4"}, ("v4", 0.002, 1e-4, 1e-4)),
+        ({"policy": "act", "recipe": "fast", "labels": "v3.1"}, ("v3.1", 0.0, 1e-4, 1e-4)),
+        ({"policy": "flow", "recipe": "paper", "lr": 1e-3}, ("v3.1", 0.0, 1e-3, 1e-4)),
+    ],
+)
+def test_flags_change_what_belongs_together(flags, expected):
+    """--labels v4 has a realign with every recipe, and --lr keeps the ratio of the encoder's learning rate."""
+    found = chosen_recipe(PolicyTrainOptions(**flags))
+    labels, *rates = expected
+    assert found.labels == labels
+    assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
+
+
+@pytest.mark.parametrize(
+    ("flags", "rates"),
+    [
+        ({"policy": "flow", "weights": "a/clip"}, (1e-4, 2e-6)),
+        ({"policy": "flow", "weights": "a/clip", "lr": 5e-5}, (5e-5, 1e-6)),
+        ({"policy": "flow", "weights": "a/clip", "recipe": "paper"}, (2e-5, 2e-6)),
+        ({"policy": "flow"}, (1e-4, 1e-4)),
+        ({"policy": "act", "weights": "a/resnet"}, (1e-4, 1e-4)),
+        ({"policy": "diffusion", "weights": "a/resnet"}, (1e-4, 1e-4)),
+        ({"policy": "pi05", "weights": "a/base"}, (2.5e-5, 2.5e-5)),
+    ],
+)
+def test_a_pretrained_encoder_is_tuned_as_slowly_as_the_papers(flags, rates):
+    """With --weights CLIP has the paper's learning rate, 2e-6; new weights, and families without one, the recipe's."""
+    found = chosen_recipe(PolicyTrainOptions(**flags))
+    assert [found.lr, found.lr_backbone] == pytest.approx(rates)
 
 
 def test_recipe_files_are_in_the_wheel():

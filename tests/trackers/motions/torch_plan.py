@@ -72,7 +72,7 @@ from arena_newton.kernels.gait import (
     WALK_PITCH,
 )
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, TICK
-from arena_newton.robot.rotations import quat_from_euler, rotate_xy, wrap_by_remainder
+from arena_newton.robot.rotations import quat_from_euler, rotate_xy
 from arena_newton.trackers.motions.commands import (
     CHANNELS,
     COLUMNS,
@@ -86,6 +86,11 @@ from arena_newton.trackers.motions.generator import REACHING_JOINTS, ReferenceFr
 from arena_newton.trackers.motions.kinematics import SOLE_CENTRE, SOLE_HEIGHT, chain, neutral_stance
 
 CAREFUL_COM_AHEAD = SOLE_CENTRE
+
+
+def wrap_by_remainder(angle: Tensor) -> Tensor:
+    """The same angle within [-pi, pi) [rad], as the kernels make it."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
 
 
 @dataclass

@@ -73,6 +73,12 @@ def trained(env, tmp_path_factory):
     return runner
 
 
+@pytest.fixture
+def still(env, monkeypatch):
+    """Robots that do not move, on which a training's files do not depend."""
+    monkeypatch.setattr(env.sim, "step", lambda: None)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_a_rollout_does_not_wait_for_the_device(library):
     """Torch reports each wait as an error: from observation to action to reward there is none."""
@@ -193,7 +199,7 @@ def test_reward_improves(env, monkeypatch):
     assert runner.samples == 10 * 8 * WORLDS
 
 
-def test_resume_goes_on_as_before(env, trained):
+def test_resume_goes_on_as_before(env, trained, still):
     """A checkpoint brings back networks, input statistics, sampling, learning rate and random numbers."""
     first, path = trained, trained.folder / "model_last.pt"
     second = make_runner(env, None)
@@ -213,7 +219,7 @@ def test_resume_goes_on_as_before(env, trained):
     assert second.current_learning_iteration == 3 and second.history[-1]["iteration"] == 3
 
 
-def test_old_checkpoints_are_deleted(env, tmp_path):
+def test_old_checkpoints_are_deleted(env, still, tmp_path):
     """The last K and every Nth stay, with the last of all and the one that was resumed from; 0 keeps everything."""
 
     def files() -> set[str]:
@@ -378,7 +384,7 @@ def signalled(env, monkeypatch, *numbers: int) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number, monkeypatch):
+def test_a_signal_ends_the_training_with_its_files(env, still, tmp_path, number, monkeypatch):
     """The iteration in flight is finished, logged and written."""
     runner = make_runner(env, tmp_path, log_interval=100)
     signalled(env, monkeypatch, number)
@@ -389,7 +395,7 @@ def test_a_signal_ends_the_training_with_its_files(env, tmp_path, number, monkey
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_interrupt_stops_at_once(env, monkeypatch):
+def test_a_second_interrupt_stops_at_once(env, still, monkeypatch):
     """A second Ctrl-C does not wait for the end of the iteration."""
     runner = make_runner(env)
     signalled(env, monkeypatch, signal.SIGINT, signal.SIGINT)
@@ -487,7 +493,7 @@ def test_curves(trained, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
-def test_start_from_weights(env, trained, tmp_path):
+def test_start_from_weights(env, trained, still, tmp_path):
     """A new training begins with the network of a weights file, and keeps it while the critic learns."""
     file = export(trained.folder / "model_last.pt", ExportOptions(tmp_path / "weights.safetensors"))
     weights = {k: v.clone() for k, v in trained.alg.get_policy().net.state_dict().items() if not k.endswith("count")}
