@@ -74,7 +74,7 @@ class ArenaEnv:
             engine: `auto`, `mujoco` or `warp`.
             device: Warp device, such as `cpu` or `cuda:0`.
             rules: Rule set or its name.
-            mode: `base`, `execution`, `semantic` or `visual`.
+            mode: One of `rule_types.MODES`.
             variant_file: A user's USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
             drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
@@ -87,6 +87,9 @@ class ArenaEnv:
         if worlds < 1:
             raise InputError(f"--worlds {worlds}: must be at least 1")
         self.spec = tasks.get(task)
+        own_layer = self.spec.own_layer(mode)
+        if own_layer and variant_file:
+            raise InputError(f"--variant {variant_file}: --mode {mode} has a scene of its own, choose one of the two")
         self.rules = rule_sets.get(rules) if isinstance(rules, str) else rules
         self.mode = mode
         self.tracker = tracker
@@ -102,7 +105,7 @@ class ArenaEnv:
             variant=None if variant_file and self.mode != "semantic" else self.spec.variant(self.mode, self.rules),
             rules=self.rules,
             drive=self.drive,
-            variant_file=variant_file,
+            variant_file=variant_file or own_layer,
             native=self.engine == "mujoco",
         )
         self.rate = tracker.rate(fast=fast_physics)

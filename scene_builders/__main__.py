@@ -27,14 +27,14 @@ class LayerOptions:
     """Write the layers of `usd_scenes` from their builders."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Parts to write: `textures`, `g1`, `lab` or a task; all by default."""
+    """Parts to write: `textures`, `patterns`, `g1`, `lab` or a task; all by default."""
     out: Path = SCENES
     """Folder to write into."""
 
 
 def parts() -> tuple[str, ...]:
     """Parts that can be built, in order; without tasks that bring their own layer."""
-    return ("textures", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
+    return ("textures", "patterns", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
 
 
 def build_all(folder: Path = SCENES, names: Sequence[str] = ()) -> list[Path]:

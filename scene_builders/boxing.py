@@ -61,6 +61,41 @@ def _bag(stage: Usd.Stage, name: str, centre: author.Vec, skin: Usd.Prim, metal:
     straps.write(stage, f"{path}/Straps", look=metal)
 
 
+def _semantic_2(folder: Path) -> None:
+    """A gym: granulate floor, striped walls, leather and blue bags, and an upright green drum with a pale band."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "Floor", texture="rubber")
+        rooms.look(stage, "Wall", texture="wallpaper")
+        rooms.look(stage, "BagBlack", (0.36, 0.17, 0.07))
+        rooms.look(stage, "BagRed", (0.04, 0.1, 0.4))
+        rooms.look(stage, "Metal", (0.5, 0.5, 0.52))
+        green, pale = rooms.look(stage, "TargetGreen", (0.1, 0.75, 0.02)), rooms.look(stage, "Pale", (0.8, 0.9, 0.6))
+        frame, edge = "/World/Target/Frame", 2 * TARGET_RADIUS
+        rooms.without(stage, f"{frame}/Ball")
+        author.cylinder(stage, f"{frame}/Drum", TARGET_RADIUS, edge, collide=False, look=green)
+        author.cylinder(stage, f"{frame}/Band", TARGET_RADIUS + 0.001, edge / 4, collide=False, look=pale)
+
+
+def _semantic_3(folder: Path) -> None:
+    """A club: mats of four hues, wooden walls, a pale and a striped bag, a green diamond, and boxes to jump on."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "Floor", texture="mats")
+        rooms.look(stage, "Wall", texture="bars")
+        rooms.look(stage, "BagBlack", (0.7, 0.66, 0.56))
+        rooms.look(stage, "Metal", (0.55, 0.2, 0.03))
+        low, high = BAG_Z
+        skin = Solids().tube((0, 0, low), (0, 0, high), BAG_RADIUS + 0.001, sides=24, tile=0.4)
+        skin.write(stage, "/World/Bag_2/Stripes", look=rooms.look(stage, "Stripes", texture="barrier"))
+        frame = "/World/Target/Frame"
+        rooms.without(stage, f"{frame}/Ball")
+        diamond = Solids()
+        for end in (-1, 1):
+            diamond.tube((0, 0, 0), (0, 0, end * TARGET_RADIUS), TARGET_RADIUS, taper=0.0, sides=4)
+        diamond.write(stage, f"{frame}/Diamond", look=rooms.look(stage, "TargetGreen", (0.0, 0.6, 0.08)))
+        steps = [((0.35, 0.35, z), (x, -5.6, z)) for x, z in ((-5.6, 0.3), (-4.7, 0.2), (-3.9, 0.12))]
+        warehouse.boxes(stage, "/World/JumpBoxes", steps, look=rooms.look(stage, "JumpBox", texture="quilt"), tile=0.7)
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(
@@ -84,3 +119,5 @@ def build(folder: Path) -> None:
         author.box(stage, f"{frame}/Cube", (SEMANTIC_EDGE / 2,) * 3, collide=False, look=green)
         author.marker(stage, f"{frame}/Bounds", (SEMANTIC_EDGE,) * 3)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.double_desk import TASK
-from scene_builders import author, rooms
+from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
 
 __all__ = ["build"]
@@ -65,17 +65,24 @@ def hammer(stage: Usd.Stage) -> None:
         rooms.contact(geom, solref=STIFF, condim=3)
 
 
+def plates() -> dict[str, tuple[author.Vec, author.Vec]]:
+    """Half sizes and centres of the crate's five plates [m]."""
+    hx, hy, h, t = CRATE_HALF_X, CRATE_HALF_Y, CRATE_HEIGHT, PLATE
+    return {
+        "Bottom": ((hx, hy, t / 2), (0, 0, t / 2)),
+        **{name: ((t / 2, hy, h / 2), (sx * (hx - t / 2), 0, h / 2)) for name, sx in (("Left", -1), ("Right", 1))},
+        **{name: ((hx - t, t / 2, h / 2), (0, sy * (hy - t / 2), h / 2)) for name, sy in (("Near", -1), ("Far", 1))},
+    }
+
+
 def crate(stage: Usd.Stage) -> None:
     """The crate: four walls and a bottom, open above; origin in the middle of its underside."""
     author.fixture(stage, "/World/Basket", (-2.8, -0.1, rooms.BENCH_TOP))
-    hx, hy, h, t = CRATE_HALF_X, CRATE_HALF_Y, CRATE_HEIGHT, PLATE
+    hx, hy, h = CRATE_HALF_X, CRATE_HALF_Y, CRATE_HEIGHT
     plastic = author.material(stage, "/World/Looks/crate", (0.16, 0.17, 0.18))
     frame = "/World/Basket/Frame"
-    author.box(stage, f"{frame}/Bottom", (hx, hy, t / 2), (0, 0, t / 2), look=plastic)
-    for name, sx in (("Left", -1), ("Right", 1)):
-        author.box(stage, f"{frame}/{name}", (t / 2, hy, h / 2), (sx * (hx - t / 2), 0, h / 2), look=plastic)
-    for name, sy in (("Near", -1), ("Far", 1)):
-        author.box(stage, f"{frame}/{name}", (hx - t, t / 2, h / 2), (0, sy * (hy - t / 2), h / 2), look=plastic)
+    for name, (half, centre) in plates().items():
+        author.box(stage, f"{frame}/{name}", half, centre, look=plastic)
     trim = Solids()
     for sy in (-1, 1):
         trim.box((hx + 0.008, 0.008, 0.012), (0, sy * hy, h - 0.012))
@@ -86,6 +93,49 @@ def crate(stage: Usd.Stage) -> None:
         trim.box((0.005, 0.06, 0.014), (sx * (hx + 0.005), 0, h - 0.06))
     trim.write(stage, f"{frame}/Trim", look=author.material(stage, "/World/Looks/crate_trim", (0.38, 0.39, 0.40)))
     author.marker(stage, f"{frame}/Inside", (2 * hx, 2 * hy, h), (0, 0, h / 2))
+
+
+def _hammer_looks(stage: Usd.Stage, handle: author.Vec, bands: author.Vec, head: author.Vec) -> None:
+    """Colours of the handle, of three bands around it and of the head, linear RGB."""
+    rooms.look(stage, "handle", handle)
+    rooms.look(stage, "iron", head, roughness=0.4)
+    rings = Solids()
+    for y in (-0.12, -0.06, 0.08):
+        rings.tube((0, y - 0.012, 0), (0, y + 0.012, 0), HANDLE_RADIUS + 0.0005, sides=24)
+    rings.write(stage, "/World/Hammer/Bands", look=rooms.look(stage, "bands", bands))
+
+
+def _semantic_2(folder: Path) -> None:
+    """A kitchen: chequered floor, striped wallpaper, blue tops on pale legs, wicker basket, red and white hammer."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "concrete", texture="lino")
+        rooms.look(stage, "charcoal", texture="wallpaper")
+        rooms.look(stage, "glass", (0.75, 0.6, 0.35))
+        rooms.look(stage, "bench_top", (0.10, 0.15, 0.26))
+        rooms.look(stage, "bench_steel", (0.55, 0.56, 0.58))
+        rooms.look(stage, "sill", (0.5, 0.16, 0.08))
+        rooms.look(stage, "crate_trim", (0.26, 0.13, 0.04))
+        _hammer_looks(stage, (0.65, 0.05, 0.03), (0.85, 0.85, 0.82), (0.75, 0.66, 0.12))
+        wicker = [(np.asarray(half) + 0.001, centre) for half, centre in plates().values()]
+        look = rooms.look(stage, "wicker", texture="wicker")
+        warehouse.boxes(stage, "/World/Basket/Frame/Wicker", wicker, look=look, tile=0.2)
+
+
+def _semantic_3(folder: Path) -> None:
+    """A studio: terrazzo floor, painted walls, slate tops on ochre legs, mint crate, pink hammer, plants and a lamp."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "concrete", texture="terrazzo")
+        rooms.look(stage, "charcoal", texture="mural")
+        rooms.look(stage, "glass", (0.12, 0.16, 0.3))
+        rooms.look(stage, "bench_top", (0.05, 0.06, 0.08))
+        rooms.look(stage, "bench_steel", (0.55, 0.36, 0.05))
+        rooms.look(stage, "sill", (0.05, 0.16, 0.22))
+        rooms.look(stage, "crate", (0.25, 0.6, 0.45))
+        rooms.look(stage, "crate_trim", (0.55, 0.05, 0.3))
+        _hammer_looks(stage, (0.8, 0.12, 0.36), (0.95, 0.85, 0.3), (0.62, 0.64, 0.66))
+        for number, x in enumerate((0.9, -5.2)):
+            decor.plant(stage, f"/World/Plant_{number}", (x, -1.0, 0), 1.2)
+        decor.lamp(stage, "/World/Lamp", (0.6, -2.2, 0))
 
 
 def build(folder: Path) -> None:
@@ -102,3 +152,5 @@ def build(folder: Path) -> None:
     for variant, bindings in looks.items():
         rooms.bind_in(stage, variant, bindings)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

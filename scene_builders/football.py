@@ -8,7 +8,7 @@ from pathlib import Path
 from pxr import Usd
 
 from arena_newton.tasks.football import TASK
-from scene_builders import author, rooms
+from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
 
 __all__ = ["build"]
@@ -21,6 +21,12 @@ BACK, BACK_HEIGHT = 5.03, 0.70
 """Rear posts' y and height [m]."""
 POST = 0.05
 """Radius of posts and crossbar [m]; our choice."""
+BACKDROP = [
+    wall
+    for sign in (-1, 1)
+    for wall in (((6.84, 0.04, 1.3), (0, sign * 6.0, 1.3)), ((0.04, 6.04, 1.3), (sign * 6.8, 0, 1.3)))
+]
+"""Half sizes and centres of the walls around the pitch [m]."""
 NET_SPACING, CORD = 0.13, 0.02
 """Mesh and cord width of the net [m]; our choice, wide enough for a 224-pixel image."""
 
@@ -51,9 +57,8 @@ def pitch(stage: Usd.Stage) -> None:
     middle = (LEFT + RIGHT) / 2
     author.quad(stage, "/World/GoalLine", (RIGHT - LEFT) / 2, 0.03, (middle, LINE, 0.003), look=white)
     walls = Solids()
-    for sign in (-1, 1):
-        walls.box((6.84, 0.04, 1.3), (0, sign * 6.0, 1.3))
-        walls.box((0.04, 6.04, 1.3), (sign * 6.8, 0, 1.3))
+    for half, centre in BACKDROP:
+        walls.box(half, centre)
     walls.write(stage, "/World/Backdrop", look=grey)
     # A ball below −0.5 m has left the field too.
     author.marker(stage, "/World/Pitch", (13.52, 11.92, 3.1), (0, 0, 1.05))
@@ -101,6 +106,44 @@ def goal(stage: Usd.Stage) -> None:
     author.marker(stage, "/World/Goal/Volume", (5.1, 2.0, 1.85), (0.05, 4.03, 0.925))
 
 
+def _semantic_2(folder: Path) -> None:
+    """A stadium: mown bands of turf, hoardings of several hues, turquoise goal with a blue net, red and blue ball."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        turf = rooms.look(stage, "grass", texture="turf")
+        author.quad(stage, "/World/Floor", 7.0, 7.0, (0, 0, 0), repeat=(7, 7), look=turf)
+        line = rooms.look(stage, "white", (0.85, 0.85, 0.85))
+        paint = {
+            "/World/CentreCircle": line,
+            "/World/Backdrop": rooms.look(stage, "hoarding", texture="hoarding"),
+            "/World/Goal/FrameLook": rooms.look(stage, "turquoise", (0.02, 0.45, 0.42)),
+            "/World/Goal/Net": rooms.look(stage, "blue", (0.05, 0.14, 0.5)),
+            "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
+        }
+        rooms.paint(stage, paint)
+
+
+def _semantic_3(folder: Path) -> None:
+    """A sports hall: blue floor with lines, wooden walls, dark red goal, yellow and purple ball, benches and cones."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.without(stage, "/World/Backdrop", "/World/CentreCircle")
+        bars = rooms.look(stage, "bars", texture="bars")
+        warehouse.boxes(stage, "/World/Hall", BACKDROP, look=bars, tile=2.0)
+        warehouse.boxes(
+            stage, "/World/Benches", [((0.2, 1.6, 0.2), (x, y, 0.2)) for x in (-5.4, 5.4) for y in (-2, 2)], look=bars
+        )
+        lines = [((0.04, 4.4, 0.001), (x, -1.0, 0.003)) for x in (-3.6, 3.6)]
+        lines += [((3.6, 0.04, 0.001), (0, y, 0.003)) for y in (-3.4, 0.0)]
+        warehouse.boxes(stage, "/World/Lines", lines, look=rooms.look(stage, "line", (0.85, 0.75, 0.6)))
+        decor.cones(stage, "/World/Cones", [(x, y, 0) for x in (-4.4, 4.4) for y in (-1.5, 1.5)])
+        paint = {
+            "/World/Floor": rooms.look(stage, "grass", texture="court"),
+            "/World/Goal/FrameLook": rooms.look(stage, "crimson", (0.36, 0.02, 0.05)),
+            "/World/Goal/Net": rooms.look(stage, "straw", (0.85, 0.72, 0.35)),
+            "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
+        }
+        rooms.paint(stage, paint)
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     variants = ("base", "semantic", "semantic_released")
@@ -127,3 +170,5 @@ def build(folder: Path) -> None:
         # The original drops a 1 kg basketball next to the robot's path to the ball.
         ball(stage, "/World/Distractor", (-0.037, 0.496, 0.929), 0.12, 1.0, rubber)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

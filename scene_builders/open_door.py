@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from arena_newton.tasks.open_door import TASK
-from scene_builders import author, rooms, warehouse
+from scene_builders import author, decor, rooms, warehouse
 
 POSITION = (-1.614, 2.314, 0.002)
 LEAF_SIZE = (1.0, 0.04, 2.14)
@@ -57,21 +57,28 @@ def _hinge(
     return joint
 
 
+_OPENING, _TOP = LEAF_SIZE[0] / 2 + GAP, LEAF_CLEARANCE + LEAF_SIZE[2] + GAP
+"""Half width and height of the opening for the leaf [m]."""
+
+
+def _panels() -> dict[str, tuple[author.Vec, author.Vec]]:
+    """Half sizes and centres of the solids of the partition [m]."""
+    (x0, x1), t, h = PARTITION_X, PARTITION_THICKNESS / 2, PARTITION_HEIGHT / 2
+    return {
+        "PanelLeft": (((-_OPENING - x0) / 2, t, h), ((x0 - _OPENING) / 2, 0, h)),
+        "PanelRight": (((x1 - _OPENING) / 2, t, h), ((x1 + _OPENING) / 2, 0, h)),
+        "Header": ((_OPENING, t, (PARTITION_HEIGHT - _TOP) / 2), (0, 0, (PARTITION_HEIGHT + _TOP) / 2)),
+    }
+
+
 def _partition(stage: Usd.Stage, frame: str, rough: Usd.Prim) -> None:
     """Left panel, right panel and header collide; seams, posts and the door casing are drawn only."""
     x0, x1 = PARTITION_X
-    opening, t = LEAF_SIZE[0] / 2 + GAP, PARTITION_THICKNESS / 2
-    top = LEAF_CLEARANCE + LEAF_SIZE[2] + GAP
+    opening, top, t, h = _OPENING, _TOP, PARTITION_THICKNESS / 2, PARTITION_HEIGHT / 2
     panel = author.material(stage, "/World/Looks/Panel", (0.42, 0.43, 0.43))
     trim = author.material(stage, "/World/Looks/Trim", (0.30, 0.31, 0.31))
     bright = author.material(stage, "/World/Looks/Rail", (0.82, 0.82, 0.80))
-    h = PARTITION_HEIGHT / 2
-    solids = {
-        "PanelLeft": (((-opening - x0) / 2, t, h), ((x0 - opening) / 2, 0, h)),
-        "PanelRight": (((x1 - opening) / 2, t, h), ((x1 + opening) / 2, 0, h)),
-        "Header": ((opening, t, (PARTITION_HEIGHT - top) / 2), (0, 0, (PARTITION_HEIGHT + top) / 2)),
-    }
-    for name, (half, centre) in solids.items():
+    for name, (half, centre) in _panels().items():
         author.box(stage, f"{frame}/{name}", half, centre, look=panel, surface=rough)
     seams = [float(x) for x in np.arange(x0 + 0.2, x1, 1.25) if abs(x) > opening + 0.1]
     parts: list[tuple[author.Vec, author.Vec]] = [((0.012, t + 0.008, h), (x, 0, h)) for x in seams]
@@ -174,6 +181,44 @@ def _back_room(stage: Usd.Stage) -> None:
     author.quad(stage, "/World/PitStripeSide", 0.06, 0.5, (-1.62, 4.45, 0.005), repeat=(0.5, 4), look=hazard)
 
 
+def _semantic_2(folder: Path) -> None:
+    """A hallway: parquet, striped wallpaper, and a door of green boards with a porthole and a brass lever."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "Floor", texture="parquet")
+        rooms.look(stage, "Wall", (0.45, 0.3, 0.12))
+        rooms.look(stage, "Trim", (0.8, 0.78, 0.72))
+        rooms.look(stage, "Rail", (0.2, 0.1, 0.05))
+        rooms.look(stage, "Leaf", texture="door")
+        brass = rooms.look(stage, "Chrome", (0.75, 0.5, 0.12), roughness=0.3)
+        paper = [(np.asarray(half) + (0, 0.001, 0), centre) for half, centre in _panels().values()]
+        look = rooms.look(stage, "Paper", texture="wallpaper")
+        warehouse.boxes(stage, "/World/Door/Frame/Paper", paper, look=look, tile=0.9)
+        leaf, middle = "/World/Door/Leaf", (LEAF_SIZE[0] / 2, 0, 1.55)
+        rooms.without(stage, f"{leaf}/Mouldings")
+        pane = rooms.look(stage, "Porthole", (0.55, 0.75, 0.85), roughness=0.2)
+        for name, radius, thickness, bound in (("Rim", 0.21, 0.046, brass), ("Pane", 0.17, 0.05, pane)):
+            author.cylinder(stage, f"{leaf}/{name}", radius, thickness, middle, axis="Y", collide=False, look=bound)
+
+
+def _semantic_3(folder: Path) -> None:
+    """A porch: mosaic floor, slate walls, a cream door with stained glass and a dark lever, a mat and plants."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "Floor", texture="mosaic")
+        rooms.look(stage, "Wall", (0.5, 0.26, 0.2))
+        rooms.look(stage, "Panel", (0.07, 0.1, 0.15))
+        rooms.look(stage, "Trim", (0.45, 0.27, 0.12))
+        rooms.look(stage, "Leaf", (0.75, 0.68, 0.5))
+        rooms.look(stage, "Chrome", (0.02, 0.02, 0.02))
+        leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.002
+        rooms.without(stage, f"{leaf}/Mouldings")
+        panes = [((0.13, y, 0.38), (x, 0, 1.5)) for x in (0.22, 0.56)] + [((0.3, y, 0.2), (0.39, 0, 0.5))]
+        warehouse.boxes(stage, f"{leaf}/Glass", panes, look=rooms.look(stage, "Glass", texture="glass"), tile=0.6)
+        mat = rooms.look(stage, "Mat", (0.3, 0.03, 0.06))
+        warehouse.boxes(stage, f"{frame}/Mat", [((0.45, 0.28, 0.002), (0, -0.5, 0.003))], look=mat)
+        for name, x in (("Left", -1.0), ("Right", 1.0)):
+            decor.plant(stage, f"{frame}/{name}Plant", (x, -0.35, 0))
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(folder, TASK, eye=(0.26556, 1.33827, 3.77471), gaze=(0.6811, 0.21343, 0.20944, 0.66834))
@@ -190,3 +235,5 @@ def build(folder: Path) -> None:
     with rooms.edit(stage, "semantic"):
         _blue_leaf(stage, "/World/Door/Leaf")
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 from pxr import Usd
 
 from arena_newton.tasks.pp_box import TASK
-from scene_builders import author, rooms
+from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
 
 __all__ = ["build"]
@@ -116,6 +116,51 @@ def clutter(stage: Usd.Stage) -> None:
     Solids().box((0.08, 0.14, 0.10), (0.0, -5.15, 0.10)).write(stage, "/World/Clutter/CartonLook", look=cardboard)
 
 
+def _semantic_2(folder: Path) -> None:
+    """A mail room: granulate floor, teal walls, wooden table, blue parcel among books, bottles and a red tray."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "concrete", texture="rubber")
+        rooms.look(stage, "charcoal", (0.05, 0.2, 0.2))
+        rooms.look(stage, "bench_top", (0.48, 0.3, 0.15))
+        rooms.look(stage, "upright", (0.7, 0.2, 0.02))
+        rooms.look(stage, "deck", (0.3, 0.3, 0.31))
+        rooms.look(stage, "cardboard", texture="crate")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "parcel", texture="parcel")})
+        author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
+        green = rooms.look(stage, "bottle", (0.02, 0.22, 0.08), roughness=0.2)
+        for index, y in enumerate((-5.9, -5.7, -4.1)):
+            author.cylinder(stage, f"/World/Clutter/Bottle_{index}", 0.04, 0.2, (0.0, y, 0.1), look=green)
+        author.box(stage, "/World/Clutter/Books", (0.08, 0.13, 0.06), (0.0, -4.5, 0.06), visual=False)
+        for index, color in enumerate(((0.55, 0.1, 0.1), (0.8, 0.7, 0.5), (0.1, 0.15, 0.4))):
+            book = [((0.08 - 0.006 * index, 0.13 - 0.01 * index, 0.019), (0.0, -4.5, 0.02 + 0.04 * index))]
+            warehouse.boxes(stage, f"/World/Clutter/Book_{index}", book, look=rooms.look(stage, f"book_{index}", color))
+        tray = rooms.look(stage, "tray", (0.6, 0.05, 0.05))
+        author.box(stage, "/World/Clutter/Tray", (0.08, 0.16, 0.03), (0.0, -5.2, 0.03), look=tray)
+
+
+def _semantic_3(folder: Path) -> None:
+    """A shop: paved floor, painted walls, pale table, wrapped gift among pots of plants, a bowl and a bread bin."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "concrete", texture="pavers")
+        rooms.look(stage, "charcoal", texture="mural")
+        rooms.look(stage, "bench_top", (0.62, 0.66, 0.6))
+        rooms.look(stage, "bench_steel", (0.2, 0.05, 0.1))
+        rooms.look(stage, "upright", (0.04, 0.2, 0.1))
+        rooms.look(stage, "deck", (0.45, 0.3, 0.16))
+        rooms.look(stage, "cardboard", texture="quilt")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "gift", texture="gift")})
+        author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
+        for index, y in enumerate((-5.85, -4.05)):
+            author.cylinder(stage, f"/World/Clutter/Pot_{index}", 0.05, 0.1, (0.0, y, 0.05), visual=False)
+            decor.plant(stage, f"/World/Clutter/Plant_{index}", (0.0, y, 0.0), 0.3)
+        bowl = rooms.look(stage, "bowl", (0.08, 0.3, 0.5), roughness=0.3)
+        author.cylinder(stage, "/World/Clutter/Bowl", 0.09, 0.05, (0.0, -5.4, 0.025), look=bowl)
+        tin = rooms.look(stage, "bread_bin", (0.75, 0.6, 0.2))
+        author.box(stage, "/World/Clutter/BreadBin", (0.07, 0.15, 0.08), (0.0, -4.5, 0.08), look=tin)
+        jar = rooms.look(stage, "jar", (0.75, 0.75, 0.78))
+        author.cylinder(stage, "/World/Clutter/Jar", 0.05, 0.16, (0.0, -5.1, 0.08), look=jar)
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     stage = rooms.task_stage(folder, TASK, eye=(0.08792, -4.59362, 2.05127), gaze=(0.63441, 0.29145, 0.29887, 0.65058))
@@ -131,3 +176,5 @@ def build(folder: Path) -> None:
     with rooms.edit(stage, "semantic"):
         clutter(stage)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

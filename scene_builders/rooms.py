@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from arena_newton.errors import InputError
 from arena_newton.tasks import TaskSpec
@@ -13,7 +13,21 @@ from scene_builders import author
 from scene_builders.author import Vec
 from scene_builders.solids import Solids
 
-__all__ = ["SEMANTICS", "bench", "bind_in", "contact", "edit", "floor", "save", "task_stage", "workshop"]
+__all__ = [
+    "SEMANTICS",
+    "bench",
+    "bind_in",
+    "contact",
+    "edit",
+    "floor",
+    "held_out",
+    "look",
+    "paint",
+    "save",
+    "task_stage",
+    "without",
+    "workshop",
+]
 
 SEMANTICS = "semantics"
 """Name of the variant set on `/World` that holds the changed looks."""
@@ -75,8 +89,13 @@ def edit(stage: Usd.Stage, variant: str) -> Iterator[None]:
 def bind_in(stage: Usd.Stage, variant: str, looks: dict[str, Usd.Prim]) -> None:
     """Bind looks to prims inside one variant of `semantics`; `looks` maps prim path to look."""
     with edit(stage, variant):
-        for path, look in looks.items():
-            author.bind(stage.OverridePrim(path), look)
+        paint(stage, looks)
+
+
+def paint(stage: Usd.Stage, looks: dict[str, Usd.Prim]) -> None:
+    """Bind looks to prims; `looks` maps prim path to look."""
+    for path, bound in looks.items():
+        author.bind(stage.OverridePrim(path), bound)
 
 
 def save(stage: Usd.Stage, folder: Path) -> None:
@@ -99,6 +118,47 @@ def save(stage: Usd.Stage, folder: Path) -> None:
 
 def variant_layer(path: Path, variant: str) -> None:
     """Write a layer that is the scene of the folder above with another variant selected, as a user's own room does."""
+    layer = _over_scene(path)
+    layer.GetPrimAtPath("/World").variantSelections[SEMANTICS] = variant
+    layer.Save()
+
+
+@contextmanager
+def held_out(folder: Path, mode: str) -> Iterator[Usd.Stage]:
+    """The layer of a held-out mode over the scene in `folder`, `variants/<mode>.usda`, written when the block ends.
+
+    Its opinions are stronger than all of the scene, whose variant `base` stays selected. What it authors is drawn: in
+    P&PBox alone it adds colliders.
+    """
+    layer = _over_scene(folder / "variants" / f"{mode}.usda")
+    yield Usd.Stage.Open(layer)
+    layer.Save()
+
+
+def look(
+    stage: Usd.Stage,
+    name: str,
+    color: Vec = (0.8, 0.8, 0.8),
+    *,
+    texture: str | None = None,
+    roughness: float = 0.8,
+    metallic: float = 0.0,
+) -> Usd.Prim:
+    """Make over the look `name` in the layer of a held-out mode, or add it; `texture` is one of the mode's patterns."""
+    path = None if texture is None else f"../../patterns/{Path(stage.GetRootLayer().identifier).stem}/{texture}.png"
+    prim = author.material(stage, f"/World/Looks/{name}", color, roughness=roughness, metallic=metallic, texture=path)
+    if path is None:
+        UsdShade.Shader(prim.GetChild("Surface")).GetInput("diffuseColor").DisconnectSource()
+    return prim
+
+
+def without(stage: Usd.Stage, *paths: str) -> None:
+    """Switch off prims of the scene below."""
+    for path in paths:
+        stage.OverridePrim(path).SetActive(False)
+
+
+def _over_scene(path: Path) -> Sdf.Layer:
     path.parent.mkdir(parents=True, exist_ok=True)
     layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else Sdf.Layer.CreateNew(str(path))
     layer.Clear()
@@ -109,9 +169,8 @@ def variant_layer(path: Path, variant: str) -> None:
     root.SetInfo("metersPerUnit", 1.0)
     root.SetInfo("kilogramsPerUnit", 1.0)
     root.SetInfo("upAxis", "Z")
-    world = Sdf.CreatePrimInLayer(layer, "/World")
-    world.variantSelections[SEMANTICS] = variant
-    layer.Save()
+    Sdf.CreatePrimInLayer(layer, "/World")
+    return layer
 
 
 def contact(

@@ -10,7 +10,8 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.sit_sofa import TASK
-from scene_builders import author, rooms, warehouse
+from scene_builders import author, decor, rooms, warehouse
+from scene_builders.solids import Solids
 
 SOFA_X = (-4.34, -2.28)
 SOFA_Y = (-1.65, -0.83)
@@ -108,6 +109,38 @@ def _look(stage: Usd.Stage, name: str, color: author.Vec, texture: str | None = 
     author.material(stage, f"/World/Looks/{name}", color, texture=path)
 
 
+def _semantic_2(folder: Path) -> None:
+    """A parlour: parquet, striped wallpaper and rug, a tartan sofa, a walnut table and blue parcels."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "Floor", texture="parquet")
+        rooms.look(stage, "Wall", texture="wallpaper")
+        rooms.look(stage, "Carpet", texture="runner")
+        rooms.look(stage, "Sofa", texture="tartan")
+        rooms.look(stage, "Table", (0.3, 0.15, 0.06))
+        rooms.look(stage, "Cardboard", texture="parcel")
+        rooms.without(stage, *(f"/World/{name}/Tape" for name in CARTONS))
+
+
+def _semantic_3(folder: Path) -> None:
+    """A lounge: terrazzo, blush walls, a round rug, a green sofa with cushions, a teal table, gifts, plant and lamp."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "Floor", texture="terrazzo")
+        rooms.look(stage, "Wall", (0.6, 0.38, 0.32))
+        rooms.look(stage, "Skirting", (0.3, 0.14, 0.1))
+        rooms.look(stage, "Sofa", (0.04, 0.2, 0.13))
+        rooms.look(stage, "Table", (0.03, 0.24, 0.3))
+        rooms.look(stage, "Cardboard", texture="gift")
+        rooms.without(stage, "/World/Carpet", *(f"/World/{name}/Tape" for name in CARTONS))
+        rug = Solids().ring(0.0, 1.45, (-3.25, -0.15, 0.004))
+        rug.write(stage, "/World/Rug", look=rooms.look(stage, "Rug", texture="quilt"))
+        for name, x, color in (("Left", -3.96, (0.75, 0.45, 0.06)), ("Right", -2.6, (0.7, 0.2, 0.25))):
+            pillow, centre = f"Pillow{name}", (x, SEAT_Y[0] + 0.09, SEAT_Z[1] + 0.19)
+            look = rooms.look(stage, pillow, color)
+            warehouse.rounded_box(stage, f"/World/Sofa/{pillow}", (0.19, 0.08, 0.19), centre, radius=0.07, look=look)
+        decor.plant(stage, "/World/Plant", (-1.75, -1.5, 0), 1.1)
+        decor.lamp(stage, "/World/Lamp", (-4.8, -1.4, 0))
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(
@@ -136,3 +169,5 @@ def build(folder: Path) -> None:
     for name, position in CARTONS.items():
         _carton(stage, name, position, (board, tape), rough)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

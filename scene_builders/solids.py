@@ -67,8 +67,17 @@ class Solids:
             self.quad(corners, tile=tile)
         return self
 
-    def tube(self, start: Vec, end: Vec, radius: float, *, sides: int = 10, tile: float | None = None) -> "Solids":
-        """A round bar of `radius` [m] from `start` to `end`, open at its ends."""
+    def tube(
+        self,
+        start: Vec,
+        end: Vec,
+        radius: float,
+        *,
+        taper: float = 1.0,
+        sides: int = 10,
+        tile: float | None = None,
+    ) -> "Solids":
+        """A round bar of `radius` [m], at its end `taper` times as thick, from `start` to `end`, open at its ends."""
         a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
         axis = _unit(b - a)
         across = _unit(np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.9 else (1.0, 0.0, 0.0)))
@@ -80,7 +89,7 @@ class Solids:
         uv = np.concatenate([np.stack([around, np.zeros_like(angle)], 1), np.stack([around, angle * 0 + length], 1)])
         k, n = np.arange(sides), sides + 1
         faces = np.concatenate([np.stack([k, k + 1, k + n + 1], 1), np.stack([k, k + n + 1, k + n], 1)])
-        self._add(np.concatenate([a + rim, b + rim]), uv, faces)
+        self._add(np.concatenate([a + rim, b + taper * rim]), uv, faces)
         return self
 
     def cord(self, start: Vec, end: Vec, width: float, normal: Vec) -> "Solids":

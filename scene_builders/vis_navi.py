@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from arena_newton.tasks.vis_navi import TASK
-from scene_builders import author, rooms, warehouse
+from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
 
 BEAM_SIZE = (1.95, 0.38, 0.28)
@@ -106,6 +106,53 @@ def _ring_sign(stage: Usd.Stage, parent: str) -> None:
     )
 
 
+def _cover(stage: Usd.Stage, look: Usd.Prim, tile: float) -> None:
+    """Draw the obstacles with a texture that repeats every `tile` m, 1 mm outside their solids."""
+    for name in OBSTACLES:
+        beam = name.startswith("Beam")
+        half = 0.5 * np.asarray(BEAM_SIZE if beam else BLOCK_SIZE)
+        cover = [(half + 0.001, (0, 0, 0.0 if beam else half[2]))]
+        warehouse.boxes(stage, f"/World/{name}/Cover", cover, look=look, tile=tile)
+
+
+def _semantic_2(folder: Path) -> None:
+    """A depot: dark granulate, teal walls, wooden crates, a filled yellow field with a cross, and a traffic cone."""
+    with rooms.held_out(folder, "semantic-2") as stage:
+        rooms.look(stage, "Floor", texture="rubber")
+        rooms.look(stage, "Wall", (0.04, 0.22, 0.22))
+        _cover(stage, rooms.look(stage, "Crate", texture="crate"), 0.5)
+        frame, (cx, cy), half = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2
+        panel = (f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline"))
+        rooms.without(stage, *panel)
+        yellow, white = rooms.look(stage, "OutlineYellow", YELLOW), rooms.look(stage, "White", (0.9, 0.9, 0.88))
+        warehouse.boxes(stage, f"{frame}/Field", [((half, half, 0.001), (cx, cy, 0.002))], look=yellow)
+        cross = [((half, 0.03, 0.001), (cx, cy, 0.003)), ((0.03, half, 0.001), (cx, cy, 0.003))]
+        warehouse.boxes(stage, f"{frame}/Cross", cross, look=white)
+        decor.cones(stage, f"{frame}/Cone", [(cx, cy + half - 0.02, 0)])
+
+
+def _semantic_3(folder: Path) -> None:
+    """A yard: paving, blush walls, barriers striped in three hues, yellow corners around a diamond, and a flag."""
+    with rooms.held_out(folder, "semantic-3") as stage:
+        rooms.look(stage, "Floor", texture="pavers")
+        rooms.look(stage, "Wall", (0.6, 0.38, 0.32))
+        _cover(stage, rooms.look(stage, "Barrier", texture="barrier"), 0.8)
+        frame, (cx, cy), half = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2
+        panel = (f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline"))
+        rooms.without(stage, *panel)
+        yellow, long, wide = rooms.look(stage, "OutlineYellow", YELLOW), half / 3, 0.04
+        corners = Solids().box((0.2, 0.2, 0.001), (cx, cy, 0.003), yaw=np.pi / 4)
+        for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            corners.box((long, wide, 0.001), (cx + sx * (half - long), cy + sy * (half - wide), 0.002))
+            corners.box((wide, long, 0.001), (cx + sx * (half - wide), cy + sy * (half - long), 0.003))
+        corners.write(stage, f"{frame}/Corners", look=yellow)
+        y = cy + half - 0.02
+        pole = Solids().tube((cx, y, 0), (cx, y, 0.85), 0.02).box((0.1, 0.1, 0.02), (cx, y, 0.02))
+        pole.write(stage, f"{frame}/Pole", look=rooms.look(stage, "Pole", (0.05, 0.05, 0.06)))
+        flag = Solids().box((0.26, 0.006, 0.17), (cx + 0.26, y, 0.66))
+        flag.write(stage, f"{frame}/Flag", look=rooms.look(stage, "Flag", texture="mural"))
+
+
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/semantic.usda` into `folder`."""
     stage = rooms.task_stage(folder, TASK, eye=(0.45796, -1.01443, 2.42268), gaze=(0.50211, 0.27898, 0.39756, 0.71555))
@@ -130,3 +177,5 @@ def build(folder: Path) -> None:
         _ring_sign(stage, frame)
         author.attribute(stage.GetPrimAtPath(f"{frame}/Zone"), "arena:round", True, Sdf.ValueTypeNames.Bool)
     rooms.save(stage, folder)
+    _semantic_2(folder)
+    _semantic_3(folder)

@@ -12,8 +12,6 @@ from pathlib import Path
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.quiet import quiet_warp
 
-MODES = ("base", "semantic", "visual", "all")
-
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -44,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     preview.add_argument("targets", nargs="*", metavar="TARGET", help="task names or USD layers; all tasks by default")
     preview.add_argument("--out", type=Path, default=Path("preview.png"), help="PNG to write")
     preview.add_argument("--size", type=int, default=320, help="width of one picture [px]")
-    preview.add_argument("--mode", choices=MODES, default="base", help="which look")
+    preview.add_argument("--mode", nargs="+", default=[], help="looks of test modes (default: base), or all")
     return parser
 
 
@@ -59,6 +57,9 @@ def _validate(args: argparse.Namespace) -> int:
     from arena_newton.usd_scenes.validate import differences, task_of, validate
 
     files = args.files or [name for name in tasks.names() if tasks.get(name).layer.is_file()]
+    for name in tasks.names():
+        if name in files:
+            files += sorted(str(path) for path in (tasks.get(name).layer.parent / "variants").glob("*.usda"))
     wrong = 0
     for name in files:
         own_task = name if name in tasks.names() else None
@@ -102,7 +103,7 @@ def _preview(args: argparse.Namespace) -> None:
     for target in args.targets:
         if target not in tasks.names():
             check_files(target)
-    print(preview(args.targets or list(tasks.names()), args.out, args.size, args.mode))
+    print(preview(args.targets or list(tasks.names()), args.out, args.size, *args.mode))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

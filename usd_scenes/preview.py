@@ -9,18 +9,20 @@ import newton
 import numpy as np
 from PIL import Image, ImageDraw
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.physics.scene import Scene, load_scene, scene_path
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.robot import g1
+from arena_newton.rules import rule_types
 from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import draw_light
 from arena_newton.usd_scenes.shapes import open_stage
 
 __all__ = ["MODES", "preview"]
 
-MODES = ("base", "semantic", "visual")
-"""Variants in which a scene can be shown; visual is the base variant under a drawn distant light."""
+MODES = tuple(mode for mode in rule_types.MODES if mode != "execution")
+"""Modes that a scene looks different in; visual is the base variant under a drawn distant light."""
 _LIGHT_SEED = 0
 """Episode seed of the light drawn for visual mode."""
 _SETTLE = 1.5
@@ -31,7 +33,7 @@ _LABEL = 18
 _GAP = 4
 
 
-def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") -> Path:
+def preview(targets: list[str], out: Path, size: int = 320, *modes: str) -> Path:
     """Render a contact sheet: one row per target and mode, ego view left, world view right.
 
     Objects are where the file puts them, dropped until they rest; the robot is held in its spawn pose.
@@ -40,7 +42,7 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
         targets: Task names or scene files.
         out: PNG to write.
         size: Width of the head camera's picture [px]; the other view has the same height.
-        mode: base, semantic, visual, or all for the three of them.
+        *modes: Some of `MODES`, or all for all of them; base when none is given.
 
     Returns:
         The path of the PNG.
@@ -48,13 +50,19 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
     Raises:
         InputError: Unknown mode, size, or a target that is not a scene.
     """
-    if mode != "all" and mode not in MODES:
-        raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
+    for mode in modes:
+        if mode != "all" and mode not in MODES:
+            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
     if size < 16:
         raise InputError(f"--size {size}: expected at least 16 pixels")
     height = round(size / _VIEWS[0][1])
-    modes = MODES if mode == "all" else (mode,)
-    rows = [(f"{target} | {name}", _views(target, height, name)) for target in targets for name in modes]
+    shown = MODES if "all" in modes else modes or ("base",)
+    rows = [
+        (f"{target} | {name}", _views(target, height, name))
+        for target in targets
+        for name in shown
+        if "all" not in modes or target in tasks.names() or name not in rule_types.HELD_OUT
+    ]
     widths = [round(height * aspect) for _, aspect in _VIEWS]
     area = (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows))
     sheet = Image.new("RGB", area, (24, 24, 24))
@@ -76,7 +84,9 @@ def preview(targets: list[str], out: Path, size: int = 320, mode: str = "base") 
 
 def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     """Pictures of one scene in one mode, uint8 [height, width, 3] each."""
-    scene = load_scene(target, worlds=1, device="cpu", native=True, variant=_variant(target, mode))
+    layer = tasks.get(target).own_layer(mode) if target in tasks.names() else None
+    variant = "base" if layer else _variant(target, mode)
+    scene = load_scene(target, worlds=1, device="cpu", native=True, variant=variant, variant_file=layer)
     lights = WorldLights.allocate(1, scene.device, scene.stage)
     if mode == "visual":
         lights.set(0, draw_light(_LIGHT_SEED, LightRange()))
@@ -90,8 +100,8 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
 
 def _variant(target: str, mode: str) -> str:
     """The variant of `semantics` to load: the one that the scene selects by itself, unless asked for semantic."""
-    if mode == "semantic":
-        return "semantic"
+    if mode == "semantic" or mode in rule_types.HELD_OUT:
+        return mode
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() if world else "") or "base"

@@ -33,7 +33,9 @@ __all__ = [
 
 Range = tuple[float, float]
 
-MODES = ("base", "execution", "semantic", "visual")
+HELD_OUT = ("semantic-2", "semantic-3")
+"""Modes whose looks are a layer of their own, `variants/<mode>.usda` next to a task's scene."""
+MODES = ("base", "execution", "semantic", *HELD_OUT, "visual")
 """Test modes of the benchmark."""
 
 

@@ -18,6 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import (
+    HELD_OUT,
     MODES,
     ByRules,
     CylinderRange,
@@ -384,12 +385,25 @@ class TaskSpec:
         _check_mode(mode)
         return rules.task(self.name).semantic_variant if mode == "semantic" else "base"
 
+    def own_layer(self, mode: str) -> Path | None:
+        """The layer that replaces the scene in this mode; None: the mode selects a `variant` of the scene.
+
+        Raises:
+            InputError: The task has no such layer.
+        """
+        if mode not in HELD_OUT:
+            return None
+        path = self.layer.parent / "variants" / f"{mode}.usda"
+        if not path.is_file():
+            raise InputError(f"--mode {mode}: task {self.name} has no {path}")
+        return path
+
     def draw(self, seed: int, mode: str, rules: RuleSet, samples: Mapping[str, Sample] | None = None) -> Draws:
         """Everything random about the episode with this seed.
 
         Args:
             seed: Episode seed.
-            mode: base, execution, semantic or visual.
+            mode: One of `rule_types.MODES`.
             rules: Rule set; it decides where a sample is put.
             samples: Record name → sample, instead of those that the seed draws.
 

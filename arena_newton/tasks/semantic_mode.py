@@ -1,8 +1,11 @@
-"""Semantic mode in words: what it changes in which of the paper's tasks, and who chose how strong these changes are."""
+"""Semantic modes in words: changes in which of the paper's tasks, and who chose how strong they are."""
+
+from collections.abc import Iterable
 
 from arena_newton import tasks
+from arena_newton.rules.rule_types import HELD_OUT
 
-__all__ = ["semantic_note", "task_title"]
+__all__ = ["semantic_note", "semantic_notes", "task_title"]
 
 CHANGES = {
     "texture": "textures and colours in",
@@ -15,6 +18,19 @@ CHANGES = {
 def task_title(task: str) -> str:
     """A task as the paper's tables name it, such as `DoubleDesk`."""
     return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
+
+
+def semantic_notes(modes: Iterable[str]) -> list[str]:
+    """Notes next to every table of numbers of these modes; none where no mode is a semantic one."""
+    played = set(modes)
+    found = [semantic_note()] if "semantic" in played else []
+    if held := " and ".join(mode for mode in HELD_OUT if mode in played):
+        found.append(
+            f"{held}: held-out looks of this project, none of the paper's: other colours, textures, drawn shapes and "
+            "decor than semantic mode, and other clutter in P&PBox; nothing else that moves or collides differs from "
+            "base mode. They count as unseen for policies that were neither trained nor tuned on them."
+        )
+    return found
 
 
 def semantic_note() -> str:

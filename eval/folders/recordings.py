@@ -27,7 +27,7 @@ def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: in
         actions: Canonical actions, one per tick, each of shape [40].
         episode_seed: The episode's seed.
         gym_id: The task's Gym id.
-        mode: `base`, `execution`, `semantic` or `visual`.
+        mode: One of `rule_types.MODES`.
 
     Raises:
         StorageError: The file cannot be written.

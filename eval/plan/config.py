@@ -372,7 +372,7 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_hash=policy_hash,
         rules_hash=rule_sets.get(options.rules).hash_for(tasks),
         variant_hash=variant_hash,
-        scenes_hash=scenes_hash(tasks, task_specs.names()),
+        scenes_hash=scenes_hash(tasks, task_specs.names(), flags.mode),
         code_hash=code_hash(),
         foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
     )

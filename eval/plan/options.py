@@ -85,7 +85,8 @@ class Conditions:
     """Conditions under which tasks are done."""
 
     mode: Several[str] = ()
-    """Evaluation modes, one or several: base (when none is named) execution semantic visual."""
+    """Evaluation modes, one or several: base (when none is named) execution semantic visual, and the held-out looks
+    semantic-2 semantic-3."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"

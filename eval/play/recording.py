@@ -46,11 +46,11 @@ PROCESS_CORES = 4
 
 
 def facts_of(
-    config: RunConfig, task: str, tracker: str, environment: JsonObject, versions: Mapping[str, str | None]
+    config: RunConfig, task: str, tracker: str, mode: str, environment: JsonObject, versions: Mapping[str, str | None]
 ) -> JsonObject:
     """Facts about the run in an episode's file: all that its bytes depend on, and no time, folder or number of worlds.
 
-    Only what concerns the episode's own task and tracker, so that its bytes do not depend on what else was played.
+    Only what concerns the episode's own task, tracker and mode: its bytes do not depend on what else was played.
     """
     identity, flags = config.identity(), config.flags
     left_out = (
@@ -70,7 +70,7 @@ def facts_of(
         "checkpoint": config.checkpoint_hashes[tracker],
         "tracker_facts": (config.tracker_facts or {}).get(tracker),
         "rules_hash": rule_sets.get(flags.rules).hash_for((task,)),
-        "scenes": scenes_hash((task,), task_specs.names()),
+        "scenes": scenes_hash((task,), task_specs.names(), (mode,)),
         "environment": comparable(environment),
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
         **({"foreign_task": config.foreign_tasks[task]} if task in config.foreign_tasks else {}),

@@ -215,7 +215,8 @@ def _refuse_differences(
         stored, environment = {"environment": named}, {key: environment[key] for key in named}
     elif "environment" not in stored:
         return
-    facts = recording.facts_of(config, config.flags.task[0], tracker, plain_facts(environment), versions())
+    flags, now_here = config.flags, plain_facts(environment)
+    facts = recording.facts_of(config, flags.task[0], tracker, flags.mode[0], now_here, versions())
     compared = [key for key in MOVING if key in stored and (key != "environment" or environment)]
     now = {key: facts.get(key) for key in compared}
     if "versions" in now:

@@ -324,7 +324,7 @@ class RunPlayer:
             noise = recording.disturbance_of(config, task, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
             if config.recording is not None:
-                described = recording.facts_of(config, task, tracker, facts, self.folder.installed)
+                described = recording.facts_of(config, task, tracker, mode, facts, self.folder.installed)
                 files = recording.demonstration_recorder(config, self.folder.path, described)
                 recorders.append(files)
 

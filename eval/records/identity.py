@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import arena_newton
 from arena_newton.errors import InputError
+from arena_newton.rules.rule_types import HELD_OUT
 
 if TYPE_CHECKING:
     from arena_newton.files.stored_json import JsonObject
@@ -172,21 +173,26 @@ def _running_code() -> str:
     return hash_paths(PACKAGE, code_files(PACKAGE))
 
 
-def scene_files(root: Path, tasks: Collection[str], known: Collection[str]) -> list[Path]:
+def scene_files(root: Path, tasks: Collection[str], known: Collection[str], modes: Collection[str] = ()) -> list[Path]:
     """Layers, textures and what else is stored next to the built-in scenes of a run's tasks.
 
-    Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`.
+    Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`, nor what is
+    named after a held-out mode that is not among `modes`.
     """
-    others = {"lab", *known} - set(tasks)
+    others, unplayed = {"lab", *known} - set(tasks), set(HELD_OUT) - set(modes)
     scenes = root / "usd_scenes"
-    found = [file for file in package_files(scenes) if file.suffix not in (".py", ".pyc")]
-    return [file for file in found if file.relative_to(scenes).parts[0] not in others]
+
+    def counts(file: Path) -> bool:
+        parts = file.relative_to(scenes).with_suffix("").parts
+        return file.suffix not in (".py", ".pyc") and parts[0] not in others and not unplayed.intersection(parts)
+
+    return [file for file in package_files(scenes) if counts(file)]
 
 
 @functools.cache
-def scenes_hash(tasks: tuple[str, ...], known: tuple[str, ...]) -> str:
+def scenes_hash(tasks: tuple[str, ...], known: tuple[str, ...], modes: tuple[str, ...]) -> str:
     """Hash of the built-in scenes of a run's tasks, taken once in a process, which imports each scene once too."""
-    return hash_paths(PACKAGE, scene_files(PACKAGE, tasks, known))
+    return hash_paths(PACKAGE, scene_files(PACKAGE, tasks, known, modes))
 
 
 def hash_paths(root: Path, files: Sequence[Path], digest: Callable[[Path], str] = hash_path) -> str:

@@ -15,7 +15,7 @@ from arena_newton.eval.statistics.stats import ResultCell, Suite, error_reasons,
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between, escaped, percent
 from arena_newton.robot.g1 import TICK
-from arena_newton.tasks.semantic_mode import semantic_note
+from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["notes", "table", "write_reports"]
 
@@ -102,8 +102,7 @@ def notes(run: RunRecord, results: Results) -> list[str]:
     outside = outside_suites(cell["task"] for cell in results["cells"])
     if outside:
         found.append(f"The averages are those of the paper's seven tasks; not in them: {' '.join(outside)}.")
-    if any(cell["mode"] == "semantic" for cell in results["cells"]):
-        found.append(semantic_note())
+    found += semantic_notes(cell["mode"] for cell in results["cells"])
     if "seed_range" in results["config"]:
         noise = " and disturbed execution" if results["config"].get("disturbance") else ""
         found.append(f"Demonstrations with seeds of their own range{noise}: no benchmark result.")

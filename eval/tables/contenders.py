@@ -15,7 +15,7 @@ from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, read_folder, runs_of
 from arena_newton.files.stored_json import Json, shown
 from arena_newton.files.text import counted, plain_text
-from arena_newton.tasks.semantic_mode import semantic_note
+from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["CONDITIONS", "MOST_CONTENDERS", "ContenderSet", "PlayedEpisode", "read_contenders"]
 
@@ -269,7 +269,7 @@ def _notes(gathered: Sequence[Compared], differ: Sequence[str]) -> list[str]:
     cells = [cell for one in gathered for cell in one.cells]
     runs = runs_of(cells)
     found = list(dict.fromkeys(message for run in runs for message in changed_conditions(run)))
-    found += [semantic_note()] if any(cell.mode == "semantic" for cell in cells) else []
+    found += semantic_notes(cell.mode for cell in cells)
     for name in dict.fromkeys((*differ, *NOTED)):
         if not _all_alike(gathered, name):
             message = "; ".join(f"{one.name}: {' and '.join(one.values(name))}" for one in gathered)

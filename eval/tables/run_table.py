@@ -22,7 +22,7 @@ from arena_newton.eval.tables.table_entries import ordered
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between
 from arena_newton.rules.rule_types import MODES
-from arena_newton.tasks.semantic_mode import semantic_note
+from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["joint_table"]
 
@@ -110,8 +110,7 @@ def _notes(runs: Sequence[RunRecord], cells: Sequence[EvaluatedCell]) -> list[st
         else:
             due = f"{len(run.records)} of {counted(due_episodes(run.document), 'episode')}"
             found.append(f"{run.folder} is shard {shard} of a plan of {run.document['planned']:,} episodes: {due}.")
-    if any(cell.mode == "semantic" for cell in cells):
-        found.append(semantic_note())
+    found += semantic_notes(cell.mode for cell in cells)
     falls = [held for cell in cells for held in cell.held("fall").values()]
     found += [f"{counted(sum(falls), 'episode')} of {len(falls)} ended in a fall."] if any(falls) else []
     return [*found, *filter(None, [error_note(cells)]), *code_notes(runs)]

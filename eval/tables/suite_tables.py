@@ -38,7 +38,7 @@ from arena_newton.eval.tables.table_entries import (
 )
 from arena_newton.eval.tables.trainings_table import trainings_table
 from arena_newton.pages.tables import percent, points
-from arena_newton.tasks.semantic_mode import semantic_note, task_title
+from arena_newton.tasks.semantic_mode import semantic_notes, task_title
 
 __all__ = ["MODE_ORDER", "suite_tables", "tracker_order"]
 
@@ -204,8 +204,8 @@ def _change(mode: str, task: str) -> str:
 
 
 def _about(*modes: str) -> str:
-    """Sentences for a reader of numbers of semantic mode."""
-    return f" {semantic_note()}" if "semantic" in modes else ""
+    """Sentences for a reader of numbers of semantic modes."""
+    return "".join(f" {note}" for note in semantic_notes(modes))
 
 
 def _reported(paper: PaperNumbers) -> str:

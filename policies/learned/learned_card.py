@@ -12,7 +12,7 @@ from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
 from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.pages.tables import Table, between, percent
-from arena_newton.tasks.semantic_mode import semantic_note
+from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "PolicyCard", "read_card", "shipped_card"]
 
@@ -139,7 +139,7 @@ class PolicyCard:
         if self.results:
             head = ("task", "tracker", "mode", "successes", "SR %", "95 % CI", "falls")
             lines += ["", "## Results", "", *Table(head, [_result(one) for one in self.results], "lllr").compact()]
-        lines += ["", semantic_note()] if any(one.mode == "semantic" for one in self.results) else []
+        lines += [line for note in semantic_notes(one.mode for one in self.results) for line in ("", note)]
         return "\n".join(lines) + "\n"
 
 

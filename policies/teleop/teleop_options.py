@@ -20,7 +20,7 @@ class SessionOptions:
     checkpoint: str | None = None
     """The tracker's weights; those that come with the package when none are named."""
     mode: str = "base"
-    """Evaluation mode: base execution semantic visual."""
+    """Evaluation mode, as of `eval run`: base execution semantic ..."""
     variant: str | None = None
     """USD file that replaces or extends the task's scene."""
     rules: str = "paper"

@@ -83,6 +83,12 @@ def test_wrong_calls_are_named(env, call, said):
         call(env)
 
 
+def test_a_held_out_mode_and_a_variant_exclude_each_other():
+    """Both replace the scene, so an environment takes one of them."""
+    with pytest.raises(InputError, match="--variant my.usda: --mode semantic-2 has a scene of its own"):
+        ArenaEnv("boxing", tracker=trackers.get("pd"), mode="semantic-2", variant_file="my.usda")
+
+
 def test_step_before_reset_is_refused():
     """An environment in which nothing runs does not step."""
     idle = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco")

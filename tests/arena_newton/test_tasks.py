@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import random
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.rules import seeding
-from arena_newton.rules.rule_types import MODES, PoseRange
+from arena_newton.rules.rule_types import HELD_OUT, MODES, PoseRange
 from arena_newton.tasks.base import light_direction, widened
 from tests.scenes import scene
 
@@ -229,6 +230,18 @@ def test_variants():
             assert spec.variant(mode, PAPER) == spec.variant(mode, RELEASED) == "base"
         assert spec.variant("semantic", PAPER) == "semantic"
     assert tasks.get("football").variant("semantic", RELEASED) == "semantic_released"
+
+
+def test_held_out_looks_are_layers_of_their_own():
+    """A held-out mode selects a layer next to the scene, in each task of the package; a task without one says so."""
+    for spec in map(tasks.get, tasks.PAPER):
+        assert all(spec.own_layer(mode) is None for mode in MODES if mode not in HELD_OUT)
+        layers = [spec.own_layer(mode) for mode in HELD_OUT]
+        assert [path.stem for path in layers] == list(HELD_OUT) and all(path.is_file() for path in layers)
+        assert {spec.variant(mode, PAPER) for mode in HELD_OUT} == {"base"}
+    bare = dataclasses.replace(tasks.get("boxing"), name="bare", scene=Path("bare/scene.usda"))
+    with pytest.raises(InputError, match=r"--mode semantic-2: task bare has no bare/variants/semantic-2.usda"):
+        bare.own_layer("semantic-2")
 
 
 def test_unknown_task_and_mode_are_refused():

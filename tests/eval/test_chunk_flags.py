@@ -135,7 +135,7 @@ def test_tasks_that_grasp_are_disturbed_less():
     assert levels["pp_box"].joints_time == 0.3 and levels["pp_box"].yaw_leak == 10.0
     scales = {"boxing": 1.0, "pp_box": 0.5, "double_desk": 0.5}
     assert config.identity()["disturbance"]["scale"] == scales
-    assert facts_of(config, "pp_box", "twist2", {}, {})["disturbance"] == levels["pp_box"].describe()
+    assert facts_of(config, "pp_box", "twist2", "base", {}, {})["disturbance"] == levels["pp_box"].describe()
     half = recording(disturb_scale=0.5)
     assert disturbance_of(half, "pp_box", 10).levels.joints == 0.01 and half.hash != config.hash
     still = recording(disturb=False)

@@ -90,6 +90,16 @@ def test_scenes_of_the_run_count():
     assert one["tracker_facts"] is None  # known when the tracker is made
 
 
+def test_held_out_looks_count_where_they_are_played():
+    """Layers and textures of a held-out mode change the identity of runs in that mode, and of no other."""
+    without, played = (
+        names(identity.scene_files(identity.PACKAGE, ("boxing",), TASKS, modes)) for modes in ((), ("semantic-2",))
+    )
+    extra = set(played) - set(without)
+    assert "usd_scenes/boxing/variants/semantic-2.usda" in extra and not any("-" in name for name in without)
+    assert len(extra) > 5 and all("semantic-2" in name for name in extra)
+
+
 def test_a_new_folder_of_scenes_counts(tmp_path):
     """Files next to the scenes, such as materials in a folder of their own, count without being named."""
     (tmp_path / "usd_scenes" / "materials").mkdir(parents=True)

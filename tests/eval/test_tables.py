@@ -11,7 +11,7 @@ from arena_newton.eval.statistics.stats import aggregate, wilson
 from arena_newton.eval.tables.run_table import joint_table
 from arena_newton.pages.tables import escaped
 from arena_newton.policies.learned.learned_card import CellResult, PolicyCard
-from arena_newton.tasks.semantic_mode import semantic_note
+from arena_newton.tasks.semantic_mode import semantic_notes
 
 
 def run_of(tmp_path, name, rows, **config):
@@ -65,9 +65,9 @@ def test_what_is_missing_is_said(tmp_path):
     assert "a is incomplete: 50 of 60 episodes." in text and "1 episode of 50 ended with an error; they count" in text
 
 
-@pytest.mark.parametrize("mode", ["base", "semantic"])
+@pytest.mark.parametrize("mode", ["base", "semantic", "semantic-3"])
 def test_semantic_numbers_say_what_they_are(tmp_path, capsys, mode):
-    """Numbers of semantic mode stand beside what it changes and who chose its strength; others do not."""
+    """Numbers of semantic modes stand beside what they change and who chose their strength; others do not."""
     a, b = tmp_path / "a", tmp_path / "b"
     for folder in (a, b):
         rows = [row | {"mode": mode, "privileged": True} for row in episodes("football", (4, 5, 7))]
@@ -78,8 +78,10 @@ def test_semantic_numbers_say_what_they_are(tmp_path, capsys, mode):
     comparison = (tmp_path / "c" / "compare.md").read_text()
     cell = CellResult(task="football", tracker="twist2", mode=mode, episodes=60, successes=16, falls=0)
     pages += [comparison, (a / "report.md").read_text(), PolicyCard(tasks=("football",), results=(cell,)).to_markdown()]
+    notes = semantic_notes(["semantic", "semantic-3"])
     for page in pages:
-        assert (semantic_note() in page or escaped(semantic_note()) in page) == (mode == "semantic"), page
+        said = [note for note in notes if note in page or escaped(note) in page]
+        assert said == semantic_notes([mode]), page
     assert "p (privileged)" in comparison
 
 

@@ -5,14 +5,16 @@ import pytest
 import torch
 from recorded_actions import assert_same_elsewhere, episodes, expert_rollout
 
-from arena_newton import trackers
+from arena_newton import policies, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.policies.experts import pp_box
 from arena_newton.policies.experts.base import DECISION, Sight
 from arena_newton.policies.experts.pp_box import LONGEST, PPBoxExpert, pose_before
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.g1 import TICK
+from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import HELD_OUT
 from arena_newton.tasks.pp_box import BOX
 
 STILL = 6
@@ -184,6 +186,13 @@ def test_our_twist2_puts_the_box_down_and_lets_go(played):
         assert [name for name, _ in result.phases][: len(ORDER)] == ORDER
         assert all(tick is not None for tick in result.predicates.values())
     assert not force.any()
+
+
+def test_the_box_is_moved_among_other_clutter():
+    """An episode of a held-out mode, with other things on the table, ends with the box on the shelf."""
+    env = ArenaEnv("pp_box", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1, mode=HELD_OUT[0])
+    (result,) = Rollout(env, policies.get("expert"), episodes(env, 5), max_steps=1600).run()
+    assert env.scene.geom_ids("/World/Clutter/Books") and result.outcome == "success"
 
 
 def test_an_episode_does_not_depend_on_its_world(twist2, played):

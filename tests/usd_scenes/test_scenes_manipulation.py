@@ -5,7 +5,7 @@ import pytest
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from scene_builders import author, rooms, textures
+from scene_builders import author, patterns, rooms, textures
 from scene_builders.__main__ import build_all
 from tests.scenes import scene
 
@@ -207,7 +207,7 @@ def test_stocked_decks_leave_the_second_one_empty():
 
 def test_layers_are_what_their_authors_write(tmp_path):
     """Building again gives the stored scenes, variants and textures, byte for byte."""
-    build_all(tmp_path, ["textures", *tasks.names()])
+    build_all(tmp_path, ["textures", "patterns", *tasks.names()])
     files = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file())
     assert len(files) >= len(textures.TEXTURES) + 2 * len(tasks.names())
     for file in files:
@@ -229,7 +229,7 @@ def test_textures_are_small(tmp_path):
     """Every texture is at most 256 pixels wide and high and 32 KiB long."""
     from PIL import Image
 
-    for path in textures.build(tmp_path):
+    for path in (*textures.build(tmp_path), *patterns.build(tmp_path)):
         assert max(Image.open(path).size) <= 256
         assert path.stat().st_size <= 32 * 1024
 

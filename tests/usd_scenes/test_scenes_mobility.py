@@ -1,5 +1,6 @@
 """OpenDoor, SitSofa, Boxing and VisNavi: what their files promise, in the model that the engines step."""
 
+import itertools
 import os
 from pathlib import Path
 
@@ -9,11 +10,14 @@ import pytest
 
 from arena_newton import rule_sets, tasks
 from arena_newton.physics.scene import SCENES, load_scene
+from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.rules.rule_types import HELD_OUT
 from arena_newton.tasks.semantic_mode import semantic_note, task_title
 from tests.scenes import scene
 
 TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
 OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")
+LOOKS = ("semantic", *HELD_OUT)
 
 
 def fresh(built, dt=0.005):
@@ -224,16 +228,19 @@ def compiled(built):
     return {name: np.asarray(value) for name, value in kept.items() if name != "signature"}
 
 
-@pytest.mark.parametrize("task", tasks.names())
-def test_semantic_mode_changes_what_its_task_says(task):
-    """Semantic mode compiles to the model of base mode to the last bit, but for geoms that are clutter by its task."""
+def scene_in(task, mode):
+    """The scene of a mode under rules `paper`."""
     spec = tasks.get(task)
-    base, changed = (scene(task, variant=spec.variant(mode, rule_sets.get("paper"))) for mode in ("base", "semantic"))
+    return scene(task, variant=spec.variant(mode, rule_sets.get("paper")), layer=spec.own_layer(mode))
+
+
+def assert_as_base(task, base, changed):
+    """Hold a look's compiled model to that of base mode, but for the geoms that are clutter by its task."""
     models = compiled(base), compiled(changed)
     assert models[0].keys() == models[1].keys() and len(models[0]) > 200
     differing = {name for name in models[0] if models[0][name].tobytes() != models[1][name].tobytes()}
     added = [label for label in changed.geom_labels if label not in base.geom_labels]
-    assert (spec.semantic_change == "clutter") == bool(added)
+    assert (tasks.get(task).semantic_change == "clutter") == bool(added)
     if added:  # things that are fixed to the world; bodies, joints and the geoms of base mode are as they were
         assert len(added) == 5 and all(label.startswith("/World/Clutter/") for label in added)
         assert all(name.startswith(("geom_", "bvh_", "nbvh", "ngeom", "body_")) for name in differing), differing
@@ -245,8 +252,28 @@ def test_semantic_mode_changes_what_its_task_says(task):
         }
     else:
         assert differing == set()
-    colours = [s.model.shape_color.numpy() for s in (base, changed)]
-    assert base.model.shape_label != changed.model.shape_label or not np.array_equal(*colours)
+
+
+def head_picture(scene):
+    """What the robot sees at its spawn pose, int [48, 64, 3]."""
+    camera = Camera.from_scene(scene, "ego", 64, 48, WorldLights.allocate(1, scene.device, scene.stage))
+    return camera.render(scene.model.state())[0].cpu().numpy().astype(int)
+
+
+@pytest.mark.parametrize("task", tasks.names())
+def test_semantic_modes_change_looks_and_clutter_alone(task):
+    """Semantic modes compile to base mode's model to the last bit, but for their task's clutter; all look different.
+
+    A held-out look changes a third of the head camera's picture, against every other mode.
+    """
+    scenes = {mode: scene_in(task, mode) for mode in ("base", *LOOKS)}
+    for mode in LOOKS:
+        assert_as_base(task, scenes["base"], scenes[mode])
+        assert scenes[mode].model.shape_count < 150
+    pictures = {mode: head_picture(built) for mode, built in scenes.items()}
+    for first, second in itertools.combinations(pictures, 2):
+        change = np.abs(pictures[first] - pictures[second]).max(axis=-1)
+        assert change.any() and ((change > 16).mean() > 0.33 or not {first, second} & set(HELD_OUT)), (first, second)
     assert task_title(task) in semantic_note()
 
 
@@ -271,7 +298,7 @@ def test_preview_writes_a_sheet(tmp_path):
 
     from arena_newton.usd_scenes.preview import preview
 
-    out = preview(["boxing"], tmp_path / "sheet.png", 64, "semantic")
+    out = preview(["boxing"], tmp_path / "sheet.png", 64, HELD_OUT[0])
     picture = np.asarray(Image.open(out))
     assert picture.shape == (48 + 18 + 4, 64 + 85 + 12, 3)
     assert picture[20:64, 6:60].std() > 10 and picture[20:64, 75:140].std() > 10

@@ -130,7 +130,7 @@ FIELDS = (
     Field("arena_instruction", "", "text", "natural language"),
     Field("arena_tracker", "", "text", "tracker"),
     Field("arena_policy", "", "text", "policy"),
-    Field("arena_mode", "", "text", "base, execution, semantic or visual"),
+    Field("arena_mode", "", "text", "the test mode, as of `--mode`"),
     Field("arena_rules", "", "text", "rule set"),
     Field("arena_seed_range", "", "text", "evaluation, demonstration or teleoperation"),
     Field("arena_group_seed", "", "int64", "number of the series"),

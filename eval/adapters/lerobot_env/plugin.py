@@ -63,7 +63,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     checkpoint: str | None = None
     """Its weights; those of the package when none are named."""
     mode: str = "base"
-    """`base`, `execution`, `semantic` or `visual`."""
+    """The test mode, as of `--mode`."""
     rules: str = "paper"
     """Rule set."""
     engine: str = "auto"
