@@ -59,6 +59,7 @@ def semantic_colours():
 def bound(scene, variant):
     """Prims that are drawn in a variant, by their texture's name or their colour."""
     stage = Usd.Stage.Open(str(scene))
+    stage.SetEditTarget(stage.GetSessionLayer())  # others read the layer in this process
     stage.GetDefaultPrim().GetVariantSet("semantics").SetVariantSelection(variant)
     found = {}
     for prim in Usd.PrimRange(stage.GetDefaultPrim()):

@@ -155,8 +155,7 @@ def test_a_home_that_is_nobodys_is_bad_input(capsys):
 @pytest.mark.parametrize(
     ("command", "library", "title"),
     [
-        ("arena_newton.eval list --task football --seeds 0", "warp", "Warp, Newton and MuJoCo"),
-        ("arena_newton.eval list --task football --seeds 0 --json", "warp", None),
+        ("arena_newton.eval bench --what tick --json", "warp", None),
         ("arena_newton.trackers.evaluate --tracker twist2", "warp", "Warp, Newton and MuJoCo"),
         ("arena_newton trackers motions inspect nothing.npz", "torch", "torch"),
         ("arena_newton scenes validate football", "pxr", "USD"),

@@ -74,7 +74,7 @@ def measure(task: str) -> dict[tuple, tuple[int, float]]:
             cluttered = spec.semantic_change == "clutter"
             variant = spec.variant(mode, rule_set) if cluttered else "base"
             layer = spec.own_layer(mode) if cluttered else None
-            built = scene(task, variant, layer)
+            built = scene(task, variant, layer=layer)
             data = mujoco.MjData(built.mj_model)
             spawn(built, spec, data)
             for group, repeat in SEEDS:

@@ -197,7 +197,8 @@ def _strip(motion: Motion, picks: Sequence[int], looks: int) -> Markup:
 
             rows += changed_rows(frames, picks, *motion.looks, looks)
     except (av.error.FFmpegError, OSError, IndexError, AttributeError) as error:  # a stream without a codec is None
-        name = getattr(error, "filename", None) or motion.video
+        name = getattr(error, "filename", None) or ""  # of an error in decoding the name of FFmpeg's function
+        name = name if Path(name).is_file() else motion.video
         raise InputError(f"{name}: not a readable video ({type(error).__name__})") from error
     height = frames[0].shape[0]
     size = max(1, round(frames[0].shape[1] * STRIP_HEIGHT / height)), STRIP_HEIGHT
