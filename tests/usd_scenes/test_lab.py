@@ -61,7 +61,9 @@ def test_the_lab_is_built_but_is_no_task():
 def test_a_part_that_nobody_builds_is_one_line(capsys):
     """An unknown name is code 2 and one line that names the parts."""
     assert main(["tennis"]) == 2
-    assert capsys.readouterr().err.startswith("error: unknown part 'tennis'; parts are textures, patterns, g1, football,")
+    assert capsys.readouterr().err.startswith(
+        "error: unknown part 'tennis'; parts are textures, patterns, g1, football,"
+    )
 
 
 def test_committed_layer_is_what_the_author_writes(tmp_path):
