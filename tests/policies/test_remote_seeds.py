@@ -26,7 +26,9 @@ class Handler(JsonHandler):
         asked = self.asked()
         with server.lock:
             server.count += 1
-            if server.drop_every and server.count % server.drop_every == 0:
+            request = self.path, asked["seed"], asked.get("step")
+            if server.drop_every and server.count % server.drop_every == 0 and request not in server.dropped:
+                server.dropped.add(request)  # once: what is asked again is answered
                 self.close_connection = True
                 return
             if self.path == "/reset":
@@ -44,7 +46,9 @@ class Handler(JsonHandler):
 
 @pytest.fixture
 def server():
-    running = JsonServer(Handler, rng=np.random.default_rng(0), seeded=True, seen={}, count=0, drop_every=0)
+    running = JsonServer(
+        Handler, rng=np.random.default_rng(0), seeded=True, seen={}, count=0, drop_every=0, dropped=set()
+    )
     yield running
     running.close()
 
@@ -112,6 +116,7 @@ def test_seeded_server_gives_the_same_for_any_batch(server):
     assert run(server, 7, shuffled, sequential=True) == (ends, seen)
     server.drop_every = 5  # requests that are asked again get the same answer
     assert run(server, 20, shuffled) == (ends, seen)
+    assert len(server.dropped) > 5
 
 
 def test_seeded_server_in_the_simulator(server):
