@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
     from arena_newton.tasks import LightDraw
 
-__all__ = ["CAMERA_PRIMS", "Buffers", "Camera", "CameraConfig", "WorldLights"]
+__all__ = ["CAMERA_PRIMS", "DOME_INTENSITY", "Buffers", "Camera", "CameraConfig", "WorldLights"]
 
 CAMERA_PRIMS = {
     "ego": "front_cam",

@@ -208,7 +208,12 @@ def _shade(luma: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
     sums = torch.zeros((len(luma), SHAPES), dtype=torch.int64, device=luma.device)
     counts = torch.zeros_like(sums).scatter_add_(1, part, torch.ones_like(part))
     mean = sums.scatter_add_(1, part, luma) / counts.clamp_min(1)
-    return ((luma + 6.0) / (mean.gather(1, part) + 6.0)).clamp_(0.0, 2.5)
+    return _over(luma, mean.gather(1, part))
+
+
+def _over(luma: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+    """Luminance over a mean, bounded in both directions so that neither noise nor a highlight becomes a colour."""
+    return ((luma + 6.0) / (mean + 6.0)).clamp_(0.0, 2.5)
 
 
 def _happens(batch: int, probability: float, device: torch.device) -> torch.Tensor:
@@ -286,7 +291,7 @@ def _with_things(
     area = thing.float().mean(dim=1, keepdim=True)
     fits = (area > 0.001) & (area < 0.15) & (task[other] != task)[:, None] & _happens(batch, probability, device)
     mean = (bright * thing).sum(dim=1, keepdim=True) / thing.sum(dim=1, keepdim=True).clamp_min(1)
-    shade = ((bright + 6.0) / (mean + 6.0)).clamp_(0.0, 2.5)
+    shade = _over(bright, mean)
     moved = torch.rand((2, batch, 1), device=device) - 0.5
     down = torch.arange(height, device=device) + (0.6 * height * moved[0]).long()
     right = torch.arange(width, device=device) + (0.9 * width * moved[1]).long()

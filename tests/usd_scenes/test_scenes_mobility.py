@@ -255,7 +255,7 @@ def assert_as_base(task, base, changed):
 
 
 def head_picture(scene):
-    """What the robot sees at its spawn pose, int [48, 64, 3]."""
+    """Head camera's picture at the spawn pose, int [48, 64, 3]."""
     camera = Camera.from_scene(scene, "ego", 64, 48, WorldLights.allocate(1, scene.device, scene.stage))
     return camera.render(scene.model.state())[0].cpu().numpy().astype(int)
 

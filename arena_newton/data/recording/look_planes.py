@@ -17,7 +17,7 @@ import warp as wp
 from arena_newton.data.readers.looks import FIRST_SHAPE, MOST_SHAPES, Looks
 from arena_newton.errors import InputError
 from arena_newton.interfaces import World
-from arena_newton.pictures.camera import Camera, WorldLights
+from arena_newton.pictures.camera import DOME_INTENSITY, Camera, WorldLights
 from arena_newton.pictures.changed_looks import luminance
 from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import LightDraw
@@ -52,7 +52,7 @@ def second_light(episode_seed: int, number: int) -> LightDraw | float:
     rng = np.random.default_rng([episode_seed, number, KEY])
     distant, strength, tilt, turn = map(float, rng.random(4))
     if distant >= DISTANT_PROBABILITY:
-        return 3000.0 * (DOME[0] + (DOME[1] - DOME[0]) * strength)
+        return DOME_INTENSITY * (DOME[0] + (DOME[1] - DOME[0]) * strength)
     steepest = visual_angle() + APART
     tilt, turn = math.radians(steepest + (FLATTEST - steepest) * tilt), math.tau * turn
     down = -math.sin(tilt) * math.cos(turn), -math.sin(tilt) * math.sin(turn), -math.cos(tilt)
