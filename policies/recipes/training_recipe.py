@@ -337,6 +337,7 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
     ("*", "compact"): _FAST,
     ("act", "compact"): {
         "batch_norm": True,
+        "cut_pad": True,
         "use_task_vector": True,
         "network": {
             "pretrained_backbone_weights": None,

@@ -82,11 +82,11 @@ def rows(text):
 
 
 def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
-    """Experts' table, then that of the learned policy: its first task and tracker, a run in a folder inside."""
+    """Experts' table, then that of the learned policy: all its tasks, its first tracker, a run in a folder inside."""
     out, printed = default_run
     tables = printed.split("| task ")
     assert len(tables) == 3 and {row[2] for row in rows(tables[1])} == {"expert"}
-    assert rows(tables[2]) == [("vis_navi", "twist2", "learned", "base", "3")]
+    assert rows(tables[2]) == [(task, "twist2", "learned", "base", "3") for task in read_card(shipped).tasks]
     last = f"report of the experts: {out}/report.html, of the policy that sees: {out}/learned/report.html"
     assert printed.splitlines()[-1] == last
     for folder, shown in ((out, tables[1]), (out / "learned", tables[2])):
@@ -303,6 +303,33 @@ def test_a_policy_is_packed_again_with_more_results(evaluated, tmp_path, capsys)
         ("vis_navi", name, mode, 1) for name, mode in (("sonic", "base"), ("twist2", "base"), ("x", "?"))
     )
     assert read_card(out).tasks == ("boxing",)
+
+
+def test_other_trainings_are_in_the_card(evaluated, tmp_path, capsys):
+    """Successes of trainings of the same recipe are next to each cell and each sum; another recipe is refused."""
+    flags = ["--device", "cpu", "--engine", "mujoco", "--seeds", "0", "--repeats", "4", "--task", "boxing"]
+    for name, said in {"again": {"seed": 7}, "small": {"recipe": "small"}}.items():
+        made = checkpoint(tmp_path / f"{name}_made", trackers=("twist2", "sonic"), **said)
+        weights = (made / "model.safetensors").read_bytes()
+        (made / "model.safetensors").write_bytes(weights[:-4] + bytes(4))
+        assert main(["pack", str(made), "--out", str(tmp_path / f"{name}_packed")]) == 0
+        played = ["--policy", f"learned:{tmp_path / f'{name}_packed'}", "--out", str(tmp_path / name)]
+        assert main([*flags, *played], stand_ins()) == 0
+    out, command = tmp_path / "p", ["pack", str(evaluated / "made"), "--out", str(tmp_path / "p"), "--tasks", "boxing"]
+    command += ["--results", str(evaluated / "whole"), "--trainings"]
+    for folder, said in {tmp_path / "small": "is of another recipe", evaluated / "whole": "no cell of another"}.items():
+        capsys.readouterr()
+        assert main([*command, str(folder)]) == 2
+        assert f"--trainings {folder}: {said}" in capsys.readouterr().err and not out.exists()
+    assert main([*command, str(tmp_path / "again")]) == 0
+    card, page = read_card(out), (out / "card.md").read_text()
+    (other,) = card.trainings
+    won = json.loads((tmp_path / "again" / "results.json").read_text())["cells"][0]["successes"]
+    assert (other.seed, [one.successes for one in other.results]) == (7, [won])
+    assert other.weights == read_card(tmp_path / "again_packed").weights and f"seed 7 (weights {other.weights})" in page
+    assert len(re.findall(rf"^\| (?:base|boxing \| twist2 \| base) \| \d/4 \|.* \| {won} \|$", page, re.M)) == 2
+    assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
+    assert read_card(out).trainings == card.trainings
 
 
 @pytest.mark.parametrize(
