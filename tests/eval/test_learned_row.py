@@ -6,7 +6,6 @@ import io
 import json
 import re
 import shutil
-from pathlib import Path
 
 import pytest
 from eval_fakes import FakePolicy, factories
@@ -384,12 +383,13 @@ def test_what_ships_can_be_packed_again(tmp_path, wide):
 
 
 def test_what_ships_fits(wide):
-    """The policy in the package, if it has one, is whole, at most 32 MB, and solves what it is offered for."""
+    """The policy in the package is whole, at most 32 MB, solves what it is offered for; its page is its card."""
     card = learned_card.shipped_card()
     if card is None:
         pytest.skip("no policy comes with this build")
     assert sum(path.stat().st_size for path in learned_card.SHIPPED.iterdir()) <= 32_000_000
     assert policies.get("learned").describe()["weights"] == card.weights
+    assert (learned_card.SHIPPED / "card.md").read_text() == card.to_markdown()
     base = {(one.task, one.tracker): one.rate for one in card.results if one.mode == "base"}
     assert card.trackers and all(base[task, tracker] >= 0.75 for task in card.tasks for tracker in card.trackers)
-    assert card.command and card.gpu_minutes > 0 and all(Path(str(one["name"])).name for one in card.datasets)
+    assert card.command and card.gpu_minutes > 0 and card.datasets and all(one["hash"] for one in card.datasets)
