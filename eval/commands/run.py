@@ -55,7 +55,7 @@ def _learned(flags: RunOptions, folder: Path) -> list[RunOptions]:
     from arena_newton.policies.learned.learned_card import shipped_card
 
     card = shipped_card()
-    known = [name for name in card.trackers if name in flags.tracker] if card is not None else []
+    known = [name for name in flags.tracker if name in card.trackers] if card is not None else []
     if card is None or not known:
         return []
     return [dataclasses.replace(flags, policy="learned", task=card.tasks, tracker=(known[0],), out=str(folder))]

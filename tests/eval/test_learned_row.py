@@ -32,8 +32,8 @@ def wide(monkeypatch, narrow):
 
 @pytest.fixture(scope="module")
 def folder(narrow, tmp_path_factory):
-    """A packed policy for VisNavi and Boxing through TWIST2."""
-    return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"))
+    """A packed policy for VisNavi and Boxing through both trackers."""
+    return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"), trackers=("sonic", "twist2"))
 
 
 def ship(patch, folder):
@@ -81,7 +81,7 @@ def rows(text):
 
 
 def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
-    """Experts' table, then that of the learned policy: all its tasks, its first tracker, a run in a folder inside."""
+    """Experts' table, then that of the learned policy: all its tasks, the default tracker, in a folder inside."""
     out, printed = default_run
     tables = printed.split("| task ")
     assert len(tables) == 3 and {row[2] for row in rows(tables[1])} == {"expert"}
@@ -126,7 +126,7 @@ def test_folders_of_earlier_versions_keep_their_flags(default_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "flags", [["--task", "vis_navi"], ["--repeats", "2"], ["--policy", "stand"], ["--tracker", "sonic"]]
+    "flags", [["--task", "vis_navi"], ["--repeats", "2"], ["--policy", "stand"], ["--tracker", "pd"]]
 )
 def test_other_runs_have_no_such_row(shipped, flags, tmp_path):
     """A run that says what it wants, or whose trackers the policy does not know, has the experts' rows alone."""
