@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,8 @@ from arena_newton.files.text import counted
 if TYPE_CHECKING:
     from arena_newton.eval.folders.results import RunRecord
     from arena_newton.eval.tables.episode_table import EvaluatedCell
-    from arena_newton.policies.learned.learned_card import CellResult, PolicyCard
+    from arena_newton.policies.learned.learned_card import CellResult, OtherTraining, PolicyCard
+    from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 
 __all__ = ["PackOptions", "run"]
 
@@ -35,11 +36,14 @@ class PackOptions:
     out: str | None = None
     """Folder to write; that of the policy that comes with the package when none is named."""
     tasks: Several[str] = ()
-    """Tasks that it is offered for, the one first that the default run shows; with results those that it solves at
+    """Tasks that it is offered for, in the order in which it plays them; with results those that it solves at
     75 % in mode base through every tracker of its training, otherwise those of its training."""
     results: Several[str] = ()
     """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
     packed again keeps its other cells."""
+    trainings: Several[str] = ()
+    """Results folders or suites of other trainings of this recipe on these datasets, whose successes stand in the card
+    next to this one's."""
     command: str = ""
     """Command of the training, if not as the checkpoint remembers it."""
     note: str = ""
@@ -56,7 +60,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED, PolicyCard, read_card
     from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
     from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
-    from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
+    from arena_newton.policies.train.checkpoint_packing import changed_looks, pack, packed_digest, training_command
 
     (given,) = checkpoints
     if options.out is not None and not options.out.strip():
@@ -69,6 +73,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     found = _results([Path(name).expanduser() for name in options.results], digests)
     kept = _kept(before, digests, found)
     found = (*found, *kept)
+    others = _trainings([Path(name).expanduser() for name in options.trainings], facts, digests)
     # Of equally good tasks the first stays the first.
     trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
     chosen = options.tasks or (_solved(found, trained, facts.trackers) if found else trained)
@@ -84,14 +89,17 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
         why = f"none is solved at {100 * ENOUGH:.0f} %" if found else "the checkpoint names none"
         raise InputError(f"--tasks: {why}; name those that it is offered for")
     out = SHIPPED if options.out is None else Path(options.out).expanduser()
-    flags = PackOptions(tasks=options.tasks, results=tuple(Path(name).name for name in options.results))
+    results, trainings = (tuple(Path(name).name for name in names) for names in (options.results, options.trainings))
+    flags = PackOptions(tasks=options.tasks, results=results, trainings=trainings)
     packed_by = shell_command(PROGRAM, "pack", given.name or given.resolve().name, *words(flags))
     card = PolicyCard(
         tasks=tuple(dict.fromkeys(chosen)),
-        command=options.command or training_command(facts.options) or (before.command if before is not None else ""),
+        command=options.command or training_command(facts) or (before.command if before is not None else ""),
+        looks=changed_looks(facts) or (before.looks if before is not None else ()),
         packed_by="; then ".join([*([before.packed_by] if before and kept else []), packed_by]),
         note=options.note or (before.note if before is not None else ""),
         results=_in_order(found, chosen, facts.trackers),
+        trainings=others or (before.trainings if before is not None and kept else ()),
     )
     card = pack(folder, out, card)
     print(f"{out}: {card.bytes / 1e6:.2f} MB, weights {card.weights}, tasks {', '.join(card.tasks)}")
@@ -111,27 +119,85 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
     """
     if not folders:
         return ()
-    from arena_newton.eval.folders.results import load_run
+    mine = f"this checkpoint (weights {' or '.join(digests)})"
+    _, cells, notes = _usual("--results", folders, digests.__contains__, mine)
+    for note in notes:
+        print(note)
+    return _counts("--results", cells)
+
+
+def _trainings(folders: Sequence[Path], facts: CheckpointFacts, digests: Sequence[str]) -> tuple[OtherTraining, ...]:
+    """Results of other trainings, in the order of their folders.
+
+    Raises:
+        InputError: A folder is unfit or unfinished, was played under conditions of its own, or holds no cell of another
+            training of this recipe on these datasets.
+    """
+    from arena_newton.policies.learned.learned_card import OtherTraining
+
+    ours = {"family": facts.family, "recipe": facts.recipe, "datasets": [dict(one) for one in facts.datasets]}
+    seeds: dict[str, int] = {}
+    found: dict[str, list[EvaluatedCell]] = {}
+    for folder in folders:  # one by one: cells of two trainings have the same names
+        runs, cells, _ = _usual(
+            "--trainings", [folder], lambda weights: weights not in ("", *digests), "another training"
+        )
+        for run in runs:
+            said = run.config.get("policy_facts") or {}
+            for name, value in ours.items():
+                if name in said and said[name] != value:
+                    raise InputError(f"--trainings {folder}: is of another {name} than this checkpoint")
+            seeds[str(said.get("weights"))] = int(said.get("seed") or 0)
+        for cell in cells:
+            found.setdefault(cell.weights, []).append(cell)
+    return tuple(
+        OtherTraining(seed=seeds.get(weights, 0), weights=weights, results=_counts("--trainings", cells))
+        for weights, cells in found.items()
+    )
+
+
+def _usual(
+    flag: str, folders: Sequence[Path], wanted: Callable[[str], bool], whose: str
+) -> tuple[list[RunRecord], list[EvaluatedCell], tuple[str, ...]]:
+    """Runs and cells of wanted weights, chunks executed as the checkpoint's own facts say, and notes for a reader.
+
+    Raises:
+        InputError: There is none, or a run is no result of the benchmark: cut budgets, another scene, or unfinished.
+    """
+    from arena_newton.eval.folders.results import is_complete, load_run
     from arena_newton.eval.tables.evaluated_cells import read_cells
-    from arena_newton.policies.learned.learned_card import CellResult
 
     read = read_cells(folders)
-    cells = [cell for cell in read.cells if cell.weights in digests]
-    plain = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
-    if not plain:
-        where = " ".join(map(str, folders))
-        raise InputError(
-            f"--results {where}: no cell of this checkpoint (weights {' or '.join(digests)}), its chunks executed whole"
-        )
-    for folder in dict.fromkeys(cell.folder for cell in plain):
-        _check_usual(load_run(folder))
-    plain.sort(key=_names)
-    for cell, other in itertools.pairwise(plain):
+    cells = [cell for cell in read.cells if wanted(cell.weights)]
+    cells = [cell for cell in cells if not cell.latency and cell.replan is None and not cell.ensemble]
+    if not cells:
+        raise InputError(f"{flag} {' '.join(map(str, folders))}: no cell of {whose}, its chunks executed whole")
+    runs = [load_run(folder) for folder in dict.fromkeys(cell.folder for cell in cells)]
+    for run in runs:
+        where = f"{flag} {run.folder}"
+        if not is_complete(run):
+            # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
+            played = f"({len(run.records):,} of {counted(run.document['planned'], 'episode')})"
+            raise InputError(f"{where}: is unfinished {played}, and what ends first is no fair sample; eval resume it")
+        for name, text in (("max_steps", "--max-steps"), ("variant", "--variant")):
+            if run.config.get(name) is not None:
+                raise InputError(f"{where}: was played with {text}, which makes it no result of the benchmark")
+    return runs, cells, read.notes
+
+
+def _counts(flag: str, cells: Sequence[EvaluatedCell]) -> tuple[CellResult, ...]:
+    """Counts of a network's cells.
+
+    Raises:
+        InputError: A cell is in two folders.
+    """
+    from arena_newton.policies.learned.learned_card import CellResult
+
+    ordered = sorted(cells, key=_names)
+    for cell, other in itertools.pairwise(ordered):
         if _names(cell) == _names(other):
             names = f"{cell.task} {cell.tracker} {cell.mode}"
-            raise InputError(f"--results {other.folder}: {names} is in {cell.folder} too; leave one of them out")
-    for note in read.notes:
-        print(note)
+            raise InputError(f"{flag} {other.folder}: {names} is in {cell.folder} too; leave one of them out")
     return tuple(
         CellResult(
             task=cell.task,
@@ -141,7 +207,7 @@ def _results(folders: Sequence[Path], digests: Sequence[str]) -> tuple[CellResul
             successes=sum(cell.held().values()),
             falls=sum(cell.held("fall").values()),
         )
-        for cell in plain
+        for cell in ordered
     )
 
 
@@ -150,24 +216,6 @@ def _kept(before: PolicyCard | None, digests: Sequence[str], found: Sequence[Cel
     if before is None or before.weights not in digests:
         return []
     return [cell for cell in before.results if _names(cell) not in {_names(one) for one in found}]
-
-
-def _check_usual(run: RunRecord) -> None:
-    """Refuse a run that is no result of the benchmark: cut budgets, another scene, or unfinished.
-
-    Raises:
-        InputError: It is one of these.
-    """
-    from arena_newton.eval.folders.results import is_complete
-
-    where = f"--results {run.folder}"
-    if not is_complete(run):
-        # Successes end before timeouts do: the first episodes of a run are no fair sample of it.
-        played = f"{len(run.records):,} of {counted(run.document['planned'], 'episode')}"
-        raise InputError(f"{where}: is unfinished ({played}), and what ends first is no fair sample; eval resume it")
-    for name, text in (("max_steps", "--max-steps"), ("variant", "--variant")):
-        if run.config.get(name) is not None:
-            raise InputError(f"{where}: was played with {text}, which makes it no result of the benchmark")
 
 
 def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:

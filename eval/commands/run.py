@@ -47,7 +47,7 @@ def run(options: RunOptions, factories: Factories | None = None) -> int:
 
 
 def _learned(flags: RunOptions, folder: Path) -> list[RunOptions]:
-    """Run of the policy that sees: the first task of its card, through the first tracker of both that it knows.
+    """Run of the policy that sees: the tasks of its card, through the first tracker of both that it knows.
 
     Returns:
         Its flags alone; none where no policy comes with this build, or it knows none of the trackers.
@@ -55,7 +55,7 @@ def _learned(flags: RunOptions, folder: Path) -> list[RunOptions]:
     from arena_newton.policies.learned.learned_card import shipped_card
 
     card = shipped_card()
-    known = [name for name in card.trackers if name in flags.tracker] if card is not None else []
+    known = [name for name in flags.tracker if name in card.trackers] if card is not None else []
     if card is None or not known:
         return []
-    return [dataclasses.replace(flags, policy="learned", task=card.tasks[:1], tracker=(known[0],), out=str(folder))]
+    return [dataclasses.replace(flags, policy="learned", task=card.tasks, tracker=(known[0],), out=str(folder))]

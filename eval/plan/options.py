@@ -37,7 +37,7 @@ __all__ = [
 QUICK_SEEDS = (0,)
 """Group seeds of the default run."""
 QUICK_REPEATS = 3
-"""Episodes per task and tracker of the default run, which takes about two minutes on two CPU cores."""
+"""Episodes per task and tracker of the default run, whose experts take about two minutes on two CPU cores."""
 QUICK_TRACKERS = ("twist2", "sonic")
 """Trackers of the default run: those whose weights come with the package."""
 

@@ -22,6 +22,7 @@ def training_entries(facts: CheckpointFacts) -> dict[str, object]:
         "steps": facts.steps,
         "seed": facts.seed,
         "gpu_minutes": facts.minutes,
+        "processes": facts.processes,
         "device": facts.device,
         "datasets": facts.datasets,
     }

@@ -14,7 +14,8 @@ from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.pages.tables import Table, between, percent
 from arena_newton.tasks.semantic_mode import semantic_notes
 
-__all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "PolicyCard", "read_card", "shipped_card"]
+__all__ = ["CARD_FILE", "CARD_PAGE", "NOT_SHIPPED", "SHIPPED", "CellResult", "OtherTraining", "PolicyCard"]
+__all__ += ["read_card", "shipped_card"]
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "learned"
 """Folder of the policy that comes with the package."""
@@ -33,6 +34,8 @@ MOST_CARD = 1 << 20
 """Largest card that is read [bytes]."""
 MOST_EPISODES = 10_000_000
 """Most episodes of a cell; more is a damaged file."""
+COUNTS = ("episodes", "successes", "falls")
+"""Numbers of a cell."""
 CELL = "task, tracker, mode, episodes, successes and falls"
 
 
@@ -73,11 +76,21 @@ Results = Annotated[tuple[CellResult, ...], Fit(f"cells with {CELL}", lambda cel
 
 
 @dataclass(frozen=True, kw_only=True)
+class OtherTraining:
+    """Another training of the same recipe on the same datasets, whose network is not packed."""
+
+    seed: int
+    weights: str
+    """First 12 hex digits of the SHA-256 of its weights."""
+    results: Results
+
+
+@dataclass(frozen=True, kw_only=True)
 class PolicyCard:
     """Card of a packed policy, which describes it."""
 
     tasks: Annotated[tuple[str, ...], Fit("at least one name", lambda names: bool(names) and all(names))]
-    """Tasks that it is offered for; the default run shows the first."""
+    """Tasks that it is offered for; the default run shows them all."""
     trackers: Annotated[tuple[str, ...], Fit("names", all)] = ()
     """Trackers through which its demonstrations were recorded."""
     family: str = ""
@@ -86,11 +99,15 @@ class PolicyCard:
     """Optimizer steps."""
     seed: int = 0
     gpu_minutes: float = 0.0
-    """Time of the training [min]."""
+    """Time of the training [min], of each of its processes."""
+    processes: int = 1
+    """Processes of the training, each with a GPU of its own."""
     device: str = ""
     """Device of the training."""
     datasets: Annotated[tuple[Mapping[str, object], ...], Fit("a list of objects")] = ()
     """Of each dataset of its training: name, hash, episodes, frames."""
+    looks: tuple[str, ...] = ()
+    """Fraction of its samples whose looks were changed, then those of single tasks, as `--looks` has them."""
     command: str = ""
     """Command of the training."""
     packed_by: str = ""
@@ -103,6 +120,7 @@ class PolicyCard:
     """Size of all files but the card [bytes]."""
     note: str = ""
     results: Results = ()
+    trainings: tuple[OtherTraining, ...] = ()
 
     def check_tasks(self, asked: Sequence[str]) -> None:
         """Refuse tasks that it is not offered for.
@@ -126,35 +144,53 @@ class PolicyCard:
             "tasks": ", ".join(self.tasks),
             "trackers of its demonstrations": ", ".join(self.trackers),
             "family, recipe": f"{self.family}, {self.recipe}",
-            "data": "; ".join(_dataset(one) for one in self.datasets),
+            "samples with changed looks": ", ".join(self.looks).replace("=", " "),
             "training": f"`{self.command}`" if self.command else "",
             "optimizer steps": f"{self.steps:,}, seed {self.seed}",
-            "GPU minutes": f"{self.gpu_minutes:.1f} on {self.device or 'an unnamed device'}",
+            "GPU minutes": f"{self.processes * self.gpu_minutes:.1f} on {self._devices()}",
             "packed by": f"`{self.packed_by}`" if self.packed_by else "",
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",
             "weights": self.weights,
+            "other trainings": ", ".join(f"seed {one.seed} (weights {one.weights})" for one in self.trainings),
         }
         about = Table(("", ""), [(name, _cell(text)) for name, text in rows.items() if text])
         lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), *about.compact()]
+        if self.datasets:
+            keys = ("name", "episodes", "frames", "hash")
+            rows_of = [[_cell(str(one.get(key, ""))) for key in keys] for one in self.datasets]
+            lines += ["", "## Data", "", *Table(("dataset", *keys[1:]), rows_of, "lrrl").compact()]
         if self.results:
-            head = ("task", "tracker", "mode", "successes", "SR %", "95 % CI", "falls")
-            lines += ["", "## Results", "", *Table(head, [_result(one) for one in self.results], "lllr").compact()]
+            head = ("successes", "SR %", "95 % CI", "falls", *["other trainings"][: len(self.trainings)])
+            modes = dict.fromkeys(one.mode for one in self.results)
+            sums = [(mode, *self._row([one for one in self.results if one.mode == mode])) for mode in modes]
+            cells = [(one.task, one.tracker, one.mode, *self._row([one])) for one in self.results]
+            lines += ["", "## Results", "", *Table(("mode", *head), sums, "lr").compact()]
+            lines += ["", *Table(("task", "tracker", "mode", *head), cells, "lllr").compact()]
         lines += [line for note in semantic_notes(one.mode for one in self.results) for line in ("", note)]
         return "\n".join(lines) + "\n"
+
+    def _devices(self) -> str:
+        return f"{self.processes} x " * (self.processes > 1) + (self.device or "an unnamed device")
+
+    def _row(self, cells: Sequence[CellResult]) -> tuple[object, ...]:
+        """Counts of some cells together, their rate with its interval, and successes of the other trainings."""
+        episodes, successes, falls = (sum(getattr(one, name) for one in cells) for name in COUNTS)
+        interval = between(wilson(successes, episodes)).replace(" to ", "–")
+        others = []
+        for training in self.trainings:
+            won = {_conditions(one): one.successes for one in training.results}
+            each = [won.get(_conditions(one)) for one in cells]
+            others.append("–" if None in each else str(sum(filter(None, each))))
+        rates = (f"{successes}/{episodes}", percent(successes / episodes, 0), interval, falls)
+        return (*rates, " ".join(others)) if others else rates
+
+
+def _conditions(one: CellResult) -> tuple[object, ...]:
+    return one.task, one.tracker, one.mode, one.episodes
 
 
 def _cell(text: str) -> str:
     return " ".join(text.replace("|", "\\|").split())
-
-
-def _dataset(facts: Mapping[str, object]) -> str:
-    counts = ", ".join(f"{facts[key]} {key}" for key in ("episodes", "frames") if key in facts)
-    return f"{facts.get('name', '?')} ({', '.join(filter(None, (counts, str(facts.get('hash', '')))))})"
-
-
-def _result(one: CellResult) -> tuple[object, ...]:
-    rates = (percent(one.rate, 0), between(wilson(one.successes, one.episodes)).replace(" to ", "–"))
-    return (one.task, one.tracker, one.mode, f"{one.successes}/{one.episodes}", *rates, one.falls)
 
 
 def read_card(folder: Path) -> PolicyCard:

@@ -71,6 +71,8 @@ class CheckpointFacts:
     seed: int = 0
     minutes: Annotated[float, Fit("a time", lambda value: abs(value) < 1e12)] = 0.0
     """Time of the training [min]."""
+    processes: Annotated[int, Fit("1 or more", lambda value: value >= 1)] = 1
+    """Processes of the training, each with a device of its own."""
     device: str = ""
     """Device of the training, such as `NVIDIA H200`."""
     datasets: tuple[Mapping[str, object], ...] = ()

@@ -31,10 +31,10 @@ from arena_newton.policies.learned.packed_checkpoint import (
     read_act_checkpoint,
     read_weights,
 )
-from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE
+from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, FACTS_FILE, CheckpointFacts
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 
-__all__ = ["MOST_BYTES", "half_weights", "pack", "packed_digest", "training_command"]
+__all__ = ["MOST_BYTES", "changed_looks", "half_weights", "pack", "packed_digest", "training_command"]
 
 MOST_BYTES = 32_000_000
 """Largest size of a packed policy, card included [bytes]."""
@@ -44,7 +44,7 @@ LATENT = "model.vae_encoder"
 """Name prefix of weights that only training uses."""
 PRIVATE = {"device": "cpu", "repo_id": None, "pretrained_path": None, "use_vae": False}
 """Fields of `config.json` that say where it was trained, and of what is left out of the file."""
-UNTOLD = ("out", "resume", "device", "log_every", "save_every", "num_workers")
+UNTOLD = ("out", "resume", "device", "log_every", "save_every", "keep", "jobs", "quiet")
 """Flags of a training that its result does not depend on."""
 
 
@@ -208,9 +208,15 @@ def _packed_files(out: Path) -> set[str]:
         ) from None
 
 
-def training_command(options: Mapping[str, object]) -> str:
+def changed_looks(facts: CheckpointFacts) -> tuple[str, ...]:
+    """Fraction of a training's samples whose looks were changed and those of single tasks, as typed; empty: none."""
+    flags = facts.options.get("flags")
+    return tuple(map(str, flags.get("looks") or ())) if isinstance(flags, dict) else ()
+
+
+def training_command(facts: CheckpointFacts) -> str:
     """The command of a training from what its checkpoint says of its flags, paths shortened to their names."""
-    flags = options.get("flags")
+    flags = facts.options.get("flags")
     if not isinstance(flags, dict):
         return ""
     words: list[str] = []
@@ -222,4 +228,6 @@ def training_command(options: Mapping[str, object]) -> str:
         if one.name in ("dataset", "weights"):
             value = [Path(str(path)).name for path in (value if isinstance(value, list) else [value])]
         words += typed(one.name, value)
-    return shell_command("arena_newton.policies.train", *words)
+    command = shell_command("arena_newton.policies.train", *words)
+    torchrun = f"torchrun --nproc-per-node {facts.processes} -m "
+    return command.replace("python -m ", torchrun, 1) if facts.processes > 1 else command

@@ -174,6 +174,7 @@ def _train(
         trackers=tuple(sorted({tracker for dataset in datasets for tracker in dataset.trackers})),
         seed=settings.seed,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        processes=processes.count,
         datasets=tuple(dataset.described for dataset in datasets),
         options={"flags": plain_options(options), "recipe": plain(dataclasses.asdict(settings))},
     )

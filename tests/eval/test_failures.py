@@ -300,7 +300,7 @@ def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
 
 
 def test_the_real_failures_are_at_hand():
-    """The set that the check counts has 60 failures and more, several of every task that the shipped policy does."""
+    """The set that the check counts has 60 failures and more of a learned policy, several of each of five tasks."""
     kept, _ = read_journal(LABELLED / "episodes.jsonl")
     strips = Path(__file__).parents[2] / "docs" / "failures_labelled"
     assert len(labelled_failures()) == len(kept) >= 60

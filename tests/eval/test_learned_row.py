@@ -6,7 +6,6 @@ import io
 import json
 import re
 import shutil
-from pathlib import Path
 
 import pytest
 from eval_fakes import FakePolicy, factories
@@ -33,8 +32,8 @@ def wide(monkeypatch, narrow):
 
 @pytest.fixture(scope="module")
 def folder(narrow, tmp_path_factory):
-    """A packed policy for VisNavi and Boxing through TWIST2."""
-    return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"))
+    """A packed policy for VisNavi and Boxing through both trackers."""
+    return packed(tmp_path_factory.mktemp("learned") / "policy", ("vis_navi", "boxing"), trackers=("sonic", "twist2"))
 
 
 def ship(patch, folder):
@@ -82,11 +81,11 @@ def rows(text):
 
 
 def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
-    """Experts' table, then that of the learned policy: its first task and tracker, a run in a folder inside."""
+    """Experts' table, then that of the learned policy: all its tasks, the default tracker, in a folder inside."""
     out, printed = default_run
     tables = printed.split("| task ")
     assert len(tables) == 3 and {row[2] for row in rows(tables[1])} == {"expert"}
-    assert rows(tables[2]) == [("vis_navi", "twist2", "learned", "base", "3")]
+    assert rows(tables[2]) == [(task, "twist2", "learned", "base", "3") for task in read_card(shipped).tasks]
     last = f"report of the experts: {out}/report.html, of the policy that sees: {out}/learned/report.html"
     assert printed.splitlines()[-1] == last
     for folder, shown in ((out, tables[1]), (out / "learned", tables[2])):
@@ -127,7 +126,7 @@ def test_folders_of_earlier_versions_keep_their_flags(default_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "flags", [["--task", "vis_navi"], ["--repeats", "2"], ["--policy", "stand"], ["--tracker", "sonic"]]
+    "flags", [["--task", "vis_navi"], ["--repeats", "2"], ["--policy", "stand"], ["--tracker", "pd"]]
 )
 def test_other_runs_have_no_such_row(shipped, flags, tmp_path):
     """A run that says what it wants, or whose trackers the policy does not know, has the experts' rows alone."""
@@ -305,6 +304,33 @@ def test_a_policy_is_packed_again_with_more_results(evaluated, tmp_path, capsys)
     assert read_card(out).tasks == ("boxing",)
 
 
+def test_other_trainings_are_in_the_card(evaluated, tmp_path, capsys):
+    """Successes of trainings of the same recipe are next to each cell and each sum; another recipe is refused."""
+    flags = ["--device", "cpu", "--engine", "mujoco", "--seeds", "0", "--repeats", "4", "--task", "boxing"]
+    for name, said in {"again": {"seed": 7}, "small": {"recipe": "small"}}.items():
+        made = checkpoint(tmp_path / f"{name}_made", trackers=("twist2", "sonic"), **said)
+        weights = (made / "model.safetensors").read_bytes()
+        (made / "model.safetensors").write_bytes(weights[:-4] + bytes(4))
+        assert main(["pack", str(made), "--out", str(tmp_path / f"{name}_packed")]) == 0
+        played = ["--policy", f"learned:{tmp_path / f'{name}_packed'}", "--out", str(tmp_path / name)]
+        assert main([*flags, *played], stand_ins()) == 0
+    out, command = tmp_path / "p", ["pack", str(evaluated / "made"), "--out", str(tmp_path / "p"), "--tasks", "boxing"]
+    command += ["--results", str(evaluated / "whole"), "--trainings"]
+    for folder, said in {tmp_path / "small": "is of another recipe", evaluated / "whole": "no cell of another"}.items():
+        capsys.readouterr()
+        assert main([*command, str(folder)]) == 2
+        assert f"--trainings {folder}: {said}" in capsys.readouterr().err and not out.exists()
+    assert main([*command, str(tmp_path / "again")]) == 0
+    card, page = read_card(out), (out / "card.md").read_text()
+    (other,) = card.trainings
+    won = json.loads((tmp_path / "again" / "results.json").read_text())["cells"][0]["successes"]
+    assert (other.seed, [one.successes for one in other.results]) == (7, [won])
+    assert other.weights == read_card(tmp_path / "again_packed").weights and f"seed 7 (weights {other.weights})" in page
+    assert len(re.findall(rf"^\| (?:base|boxing \| twist2 \| base) \| \d/4 \|.* \| {won} \|$", page, re.M)) == 2
+    assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
+    assert read_card(out).trainings == card.trainings
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -357,12 +383,13 @@ def test_what_ships_can_be_packed_again(tmp_path, wide):
 
 
 def test_what_ships_fits(wide):
-    """The policy in the package, if it has one, is whole, at most 32 MB, and solves what it is offered for."""
+    """The policy in the package is whole, at most 32 MB, solves what it is offered for; its page is its card."""
     card = learned_card.shipped_card()
     if card is None:
         pytest.skip("no policy comes with this build")
     assert sum(path.stat().st_size for path in learned_card.SHIPPED.iterdir()) <= 32_000_000
     assert policies.get("learned").describe()["weights"] == card.weights
+    assert (learned_card.SHIPPED / "card.md").read_text() == card.to_markdown()
     base = {(one.task, one.tracker): one.rate for one in card.results if one.mode == "base"}
     assert card.trackers and all(base[task, tracker] >= 0.75 for task in card.tasks for tracker in card.trackers)
-    assert card.command and card.gpu_minutes > 0 and all(Path(str(one["name"])).name for one in card.datasets)
+    assert card.command and card.gpu_minutes > 0 and card.datasets and all(one["hash"] for one in card.datasets)

@@ -24,7 +24,7 @@ from arena_newton.policies.learned.learned_policy import LearnedPolicy
 from arena_newton.policies.learned.packed_checkpoint import read_act_checkpoint
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.train import checkpoint_packing
-from arena_newton.policies.train.checkpoint_packing import pack, packed_digest, training_command
+from arena_newton.policies.train.checkpoint_packing import changed_looks, pack, packed_digest, training_command
 from tests.fuzz.mutants import damaged
 
 TASKS = ("boxing", "vis_navi")
@@ -63,20 +63,21 @@ def copy(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "side"),
     [
-        {},
-        {"pre_norm": True, "n_encoder_layers": 2, "n_decoder_layers": 2},
-        {"feedforward_activation": "gelu", "n_heads": 4, "latent_dim": 5},
+        ({}, (64, 64)),
+        ({"pre_norm": True, "n_encoder_layers": 2, "n_decoder_layers": 2}, (64, 64)),
+        ({"feedforward_activation": "gelu", "n_heads": 4, "latent_dim": 5}, (48, 64)),
     ],
-    ids=["post-norm", "pre-norm", "gelu"],
+    ids=["post-norm", "pre-norm", "gelu, 4:3"],
 )
-def test_answers_are_those_of_lerobot(tmp_path, changes):
+def test_answers_are_those_of_lerobot(tmp_path, changes, side):
     """The same files give the same actions, to 1e-5, through LeRobot and through our own forward pass."""
-    folder = save(tmp_path / "act", "act", facts=facts(**OURS), spread=1.0, **changes)
+    seen_as = {"height": side[0], "width": side[1], "fit": "pad" if side[0] == side[1] else "native"}
+    folder = save(tmp_path / "act", "act", facts=facts(**OURS, **seen_as), spread=1.0, side=side, **changes)
     pack(folder, tmp_path / "out", CARD)
     ours, theirs = LearnedPolicy(tmp_path / "out"), LeRobotPolicy(tmp_path / "out")
-    first, second = follow(ours, [1, 2], 2), follow(theirs, [1, 2], 2)
+    first, second = (follow(policy, [1, 2], 2, side=side) for policy in (ours, theirs))
     assert ours.chunk_size == theirs.chunk_size == CHUNK and ours.labels == theirs.labels == "v4"
     assert ours.realign == theirs.realign and ours.camera == theirs.camera
     for seed, actions in first.items():
@@ -179,6 +180,8 @@ def test_the_card_says_what_the_training_was(packed):
     files = [path for path in packed.iterdir() if not path.name.startswith("card.")]
     assert card.bytes == sum(path.stat().st_size for path in files)
     assert "1.5 on a device" in page and "| tasks | boxing |" in page
+    two = dataclasses.replace(card, processes=2, looks=("0.6", "double_desk=0.3")).to_markdown()
+    assert "3.0 on 2 x a device" in two and "| samples with changed looks | 0.6, double_desk 0.3 |" in two
     assert not any(b"/data" in path.read_bytes() for path in packed.iterdir() if path.suffix in (".json", ".md"))
 
 
@@ -186,8 +189,12 @@ def test_the_command_of_a_training():
     """A training's flags become its command, defaults and paths of its machine left out."""
     flags = {"policy": "act", "recipe": "compact", "dataset": ["/a/navi", "/b/boxing"], "steps": 20, "out": "/x/y"}
     wanted = "python -m arena_newton.policies.train --policy act --dataset navi boxing --recipe compact --steps 20"
-    assert training_command({"flags": flags | {"device": "cuda", "lr": 0.0}}) == wanted
-    assert training_command({}) == ""
+    told = facts(options={"flags": flags | {"device": "cuda", "lr": 0.0}})
+    assert training_command(told) == wanted and changed_looks(told) == ()
+    assert training_command(facts()) == ""
+    looks = facts(options={"flags": flags | {"looks": ["0.6", "double_desk=0.3"]}}, processes=2)
+    assert training_command(looks).startswith("torchrun --nproc-per-node 2 -m arena_newton.policies.train --policy act")
+    assert changed_looks(looks) == ("0.6", "double_desk=0.3")
 
 
 def test_a_task_that_it_does_not_do_is_refused(packed):

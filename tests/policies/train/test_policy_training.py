@@ -275,6 +275,7 @@ def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
         second.kill()
     progress = training_state.TrainingProgress.read(out / "checkpoints" / "last")
     assert (progress.step, progress.processes, progress.batch_size) == (3, 2, 2)
+    assert CheckpointFacts.read(checkpoint_folder(out)).processes == 2
     assert agreed == [1, 2, 3]
     assert not torch.distributed.is_initialized()
 
