@@ -27,7 +27,7 @@ from arena_newton.physics.devices import resolve_engine
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
-from arena_newton.pictures.settings import CameraConfig
+from arena_newton.pictures.settings import FRONT, CameraConfig
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import STAND_ACTION, STATE_WIDTH
 from arena_newton.tracking import TrackerLoop, WorldMask
@@ -63,6 +63,7 @@ class ArenaEnv:
         fast_physics: bool = False,
         drive: DriveGains | None = None,
         camera: CameraConfig | None = None,
+        cameras: Mapping[str, CameraConfig] | None = None,
         threads: int | None = None,
     ):
         """Build the scene and bind tracker, judge and kernels.
@@ -78,7 +79,8 @@ class ArenaEnv:
             variant_file: A user's USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
             drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
-            camera: Head camera for policies that see, or None.
+            camera: Head camera for policies that see: the same as `cameras={"front": camera}`.
+            cameras: Cameras for policies that see, by the names of their pictures.
             threads: CPU threads of engine `mujoco`; all by default.
 
         Raises:
@@ -95,7 +97,9 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
-        load_kernels(self.engine, device, camera=camera is not None, suite=self.spec.suite)
+        self.camera_configs = dict(cameras or ({} if camera is None else {FRONT: camera}))
+        """Configurations of `cameras`."""
+        load_kernels(self.engine, device, camera=bool(self.camera_configs), suite=self.spec.suite)
         original = tracker.original_drive if self.rules.original_drive else None
         self.drive = drive or original or tracker.drive
         self.scene = load_scene(
@@ -132,12 +136,10 @@ class ArenaEnv:
         self._chosen, self._stepping = WorldMask(self.worlds, self.device), WorldMask(self.worlds, self.device)
         self._lights: WorldLights | None = None
         self._newton_state: newton.State | None = None
-        self.camera: Camera | None = None
-        """Head camera of policies that see."""
-        self.camera_config = camera
-        """Configuration that it was made from."""
-        if camera is not None:
-            self.camera = Camera.from_scene(self.scene, lights=self.lights, **dataclasses.asdict(camera))
+        self.cameras = {
+            name: Camera.of_config(self.scene, one, self.lights) for name, one in self.camera_configs.items()
+        }
+        """Cameras of policies that see, by the names of their pictures."""
         self._bind_kernels()
 
     def _bind_kernels(self) -> None:
@@ -189,6 +191,16 @@ class ArenaEnv:
         """Release the physics' threads; the environment steps no more."""
         self.physics.close()
         self.active[:] = False
+
+    @property
+    def camera(self) -> Camera | None:
+        """Head camera of policies that see."""
+        return self.cameras.get(FRONT)
+
+    @property
+    def camera_config(self) -> CameraConfig | None:
+        """Configuration that it was made from."""
+        return self.camera_configs.get(FRONT)
 
     @property
     def lights(self) -> WorldLights:
@@ -278,13 +290,13 @@ class ArenaEnv:
         return mask
 
     def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
-        """State 64 of every world and, if asked, the head camera's picture of the worlds in `mask`.
+        """State 64 of every world and, if asked, the cameras' pictures of the worlds in `mask`.
 
         At a world's step 0 it is anchored first: its heading is relative to the robot as it is then.
 
         Args:
             mask: Worlds that ask, bool, shape [worlds]; by default all that run and are past their start-up.
-            image: Render the head camera too.
+            image: Render the cameras too.
 
         Returns:
             The observation; its state is a live view of the environment's buffer.
@@ -294,19 +306,23 @@ class ArenaEnv:
         """
         self._anchor(self.active)
         self._observe()
-        picture = None
-        if image:
-            if self.camera is None:
-                raise InputError("the policy needs images, but the environment was built without a camera")
-            picture = self.render(self.camera, mask)
+        images, depths = dict[str, torch.Tensor](), dict[str, torch.Tensor]()
+        if image and not self.cameras:
+            raise InputError("the policy needs images, but the environment was built without a camera")
+        for name, camera in self.cameras.items() if image else ():
+            images[name] = self.render(camera, mask)
+            if self.camera_configs[name].depth:
+                depths[name] = camera.distance_picture().half()
         return Observation(
             state=self._state,
-            image=picture,
+            image=images.get(FRONT),
             mask=self.active & (self.tick >= 0) if mask is None else mask,
             task=self.spec.name,
             gym_id=self.spec.gym_id,
             instruction=self.spec.instruction,
             tracker=self.tracker.name,
+            images=images,
+            depths=depths,
         )
 
     def render(self, camera: Camera, mask: np.ndarray | None = None) -> torch.Tensor:

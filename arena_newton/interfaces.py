@@ -54,7 +54,7 @@ class Observation:
     state: torch.Tensor
     """Canonical state, float32, shape [worlds, 64]."""
     image: torch.Tensor | None
-    """Head camera, uint8, shape [worlds, H, W, 3]; None when the policy needs none."""
+    """Head camera, uint8, shape [worlds, H, W, 3]; None when the policy needs none: `images["front"]`."""
     mask: np.ndarray
     """Worlds that ask for a new chunk, bool, shape [worlds]."""
     task: str
@@ -65,6 +65,17 @@ class Observation:
     """Natural-language instruction."""
     tracker: str = ""
     """Name of the tracker that executes the actions; empty: not known."""
+    images: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """Pictures of all cameras that the policy wants, by their names, each as `image`."""
+    depths: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """Distance along the ray to what each pixel of a picture shows [m], 0 where it shows nothing, float16, shape
+    [worlds, H, W]; of cameras with `depth`, and of worlds that ask."""
+
+    def __post_init__(self) -> None:
+        """One of `image` and `images` says the other."""
+        if self.image is not None and not self.images:
+            self.images = {"front": self.image}
+        self.image = self.images.get("front")
 
 
 @dataclass
@@ -336,10 +347,14 @@ class World(Protocol):
     """Worlds that run an episode, bool, shape [worlds]."""
     budget: int
     """Step budget of the rule set [ticks]."""
-    camera: Camera | None
-    """Head camera of policies that see."""
-    camera_config: CameraConfig | None
-    """Configuration that it was made from."""
+    cameras: dict[str, Camera]
+    """Cameras of policies that see, by the names of their pictures."""
+    camera_configs: dict[str, CameraConfig]
+    """Configurations that they were made from."""
+
+    @property
+    def camera(self) -> Camera | None:
+        """Head camera of policies that see."""
 
     @property
     def physics(self) -> Physics:
@@ -363,7 +378,7 @@ class World(Protocol):
         """End the episodes of `worlds`: they stand still until their next reset."""
 
     def observe(self, mask: np.ndarray | None = None, *, image: bool = False) -> Observation:
-        """State of every world and, if asked, the head camera's picture of the worlds in `mask`."""
+        """State of every world and, if asked, the cameras' pictures of the worlds in `mask`."""
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
         """Advance active worlds (those of a bool mask, if given) by one tick.

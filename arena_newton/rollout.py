@@ -28,6 +28,7 @@ from arena_newton.interfaces import (
 )
 from arena_newton.kernels import tick as codes
 from arena_newton.physics.policy_view import PolicyView
+from arena_newton.pictures.settings import policy_cameras
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 from arena_newton.robot.g1 import TICK
 from arena_newton.rules import seeding
@@ -136,12 +137,13 @@ class Rollout:
         """
         env = self.env
         self.policy.attach(self._view)
+        sees = bool(policy_cameras(self.policy))
         self._assign(range(env.worlds))
         while env.active.any():
             asks = env.active & (env.tick >= 0) & (self._next + self.latency >= self._length)
             observation = None
             if asks.any():
-                observation = env.observe(asks, image=self.policy.needs_image)
+                observation = env.observe(asks, image=sees)
                 failed = self._ask(observation)
                 if failed:
                     self._assign(failed)

@@ -20,6 +20,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from arena_newton.errors import ArenaError
+from arena_newton.pictures.settings import FRONT
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.demonstration_rows import (
@@ -114,7 +115,7 @@ def _lerobot_steps(options: TrainingBenchOptions, settings: TrainingRecipe, devi
     """LeRobot's loop: its data loader, its processors, `policy.forward`, its optimizer; yields the loss."""
     datasets, stats = _read(options, settings)
     model = families.build(settings, stats, device, options.weights or None)
-    root, camera, fps = datasets[0].root, datasets[0].camera, 50
+    root, camera, fps = datasets[0].root, datasets[0].cameras[FRONT], 50
     cut = (settings.picture - settings.height) // 2
     config = model.policy.config
     deltas = {"action": [tick / fps for tick in config.action_delta_indices]}

@@ -119,7 +119,7 @@ def _ask(
     """Play clients, each in a thread, and send the times of their answers."""
     state = np.zeros(STATE_WIDTH, np.float32)
     state[[0, 3]] = 1.0
-    query = Query(state, np.zeros(shape, np.uint8), task="boxing", instruction="Box.")
+    query = Query(state, {"front": np.zeros(shape, np.uint8)}, task="boxing", instruction="Box.")
     openpi = protocol == "openpi"
     body = openpi_codec.pack_request(query) if openpi else vla_eval_codec.pack_request(query, 1, 0.0)
     times: list[float] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,6 +57,10 @@ class Policy:
     """True if the head camera must be rendered for `act`."""
     camera: CameraConfig | None = None
     """The picture that the policy wants; None: 224×224 with black bars, as the original prepares policy images."""
+    cameras: Mapping[str, CameraConfig] | None = None
+    """Pictures that a policy of several cameras wants, by the names of `Observation.images`: `front`, `left_wrist`,
+    `right_wrist`, `world`, or another name for the `prim` of a camera of the scene. None: `camera` alone, where
+    `needs_image`."""
     labels: str | None = None
     """Protocol of its actions (`data.readers.label_protocols`), if always the same; None: as `--labels` says."""
     realign: float = 0.0

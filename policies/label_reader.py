@@ -66,6 +66,7 @@ class V4Policy(Policy):
         self.policy, self._late = policy, late
         self.name = policy.name
         self.needs_image, self.camera = policy.needs_image, policy.camera
+        self.cameras = getattr(policy, "cameras", None)
         self.chunk_size = policy.chunk_size
         self.in_pieces = bool(getattr(policy, "in_pieces", False))
         self._realign = float(getattr(policy, "realign", 0.0))

@@ -42,7 +42,7 @@ def _check(argv: Sequence[str]) -> int:
 
     from arena_newton.cli.quiet import quiet_warp
     from arena_newton.env import ArenaEnv
-    from arena_newton.pictures.settings import CameraConfig
+    from arena_newton.pictures.settings import policy_cameras
     from arena_newton.policies.base import get, is_privileged
     from arena_newton.testing import check_policy
     from arena_newton.testing.findings import table
@@ -53,8 +53,8 @@ def _check(argv: Sequence[str]) -> int:
     policy = get(args.spec)
 
     def make_worlds(worlds: int) -> ArenaEnv:
-        camera = (policy.camera or CameraConfig()) if policy.needs_image else None
-        return ArenaEnv(args.task, tracker=PdTracker(), worlds=worlds, engine="mujoco", camera=camera, rules="released")
+        cameras, tracker = policy_cameras(policy), PdTracker()
+        return ArenaEnv(args.task, tracker=tracker, worlds=worlds, engine="mujoco", cameras=cameras, rules="released")
 
     seeds = SEEDS if args.seeds is None else tuple(args.seeds)
     made = make_worlds if is_privileged(policy) else None

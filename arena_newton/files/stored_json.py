@@ -299,6 +299,9 @@ def _maker(hint: object) -> Callable[[Json], object] | None:
     if origin is tuple:
         each = _maker(parts[0])
         return tuple if each is None else lambda v: tuple(map(each, v))
+    if origin in (dict, collections.abc.Mapping):
+        value = _maker(parts[1])
+        return None if value is None else lambda v: {key: value(one) for key, one in v.items()}
     return functools.partial(_made, hint) if isinstance(hint, type) and dataclasses.is_dataclass(hint) else None
 
 

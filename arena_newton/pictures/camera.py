@@ -365,6 +365,12 @@ class Camera:
             views=views,
         )
 
+    @classmethod
+    def of_config(cls, scene: Scene, config: CameraConfig, lights: WorldLights) -> Camera:
+        """A camera of the scene as a configuration has it; see `from_scene`."""
+        size = config.width, config.height
+        return cls.from_scene(scene, config.prim, *size, lights, fit=config.fit, samples=config.samples)
+
     def render(self, state: newton.State, mask: np.ndarray | torch.Tensor | wp.array | None = None) -> torch.Tensor:
         """Render the worlds of a mask; the pictures of the others stay as they were.
 

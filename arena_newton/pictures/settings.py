@@ -1,11 +1,19 @@
 """Sizes and lenses that a run asks for: checked while it is planned, so nothing heavy is imported here."""
 
-from dataclasses import dataclass
-from typing import Literal
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 from arena_newton.errors import InputError
 
+if TYPE_CHECKING:
+    from arena_newton.interfaces import Policy
+
 __all__ = [
+    "CAMERAS",
+    "FRONT",
     "MOST_PORT",
     "MOST_VIEWED",
     "SIZE_LIMITS",
@@ -13,11 +21,17 @@ __all__ = [
     "VIEWERS",
     "CameraConfig",
     "Fit",
+    "policy_cameras",
+    "recorded_camera",
     "robot_fit",
     "video_sizes",
 ]
 
 Fit = Literal["native", "pad"]
+FRONT = "front"
+"""Name of the head camera in datasets, and of its picture among those that a policy observes."""
+CAMERAS = {FRONT: "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
+"""Name in datasets (the original's), and of what policies observe → camera of the scene."""
 STRIP_SIZES = {"ego": (320, 240), "world": (480, 270)}
 """Size of a strip's frames (width, height) [px]."""
 VIDEO_SIZE = (480, 270)
@@ -47,11 +61,31 @@ class CameraConfig:
     (4:3 for the robot's cameras) inside width × height, black around it, as the original prepares policy images."""
     samples: int = 1
     """Rays per pixel along each axis (2 is 4 rays per pixel: smooth edges for videos)."""
+    depth: bool = False
+    """Observe depth next to the picture; for policies."""
+
+
+def policy_cameras(policy: Policy) -> dict[str, CameraConfig]:
+    """Pictures that a policy wants, by name: its `cameras`, or the head camera's alone where it `needs_image`.
+
+    A camera of `CAMERAS` whose `prim` is left at its default is the one of its name.
+    """
+    named: Mapping[str, CameraConfig] | None = getattr(policy, "cameras", None)  # a plug-in need not know of several
+    if named is None:
+        return {FRONT: getattr(policy, "camera", None) or CameraConfig()} if policy.needs_image else {}
+    own = CameraConfig.prim
+    return {name: replace(one, prim=CAMERAS.get(name, own)) if one.prim == own else one for name, one in named.items()}
 
 
 def robot_fit(width: int, height: int) -> Fit:
     """Default fit of a robot's camera into a size [px]: whole where the size is its own 4:3, else padded."""
     return "native" if 3 * width == 4 * height else "pad"
+
+
+def recorded_camera(name: str, width: int, height: int, fit: Fit | None = None) -> CameraConfig:
+    """A camera of `CAMERAS` as demonstrations show it in a size [px]; the world camera has no sensor to keep to."""
+    fit = "native" if name == "world" else fit or robot_fit(width, height)
+    return CameraConfig(width=width, height=height, prim=CAMERAS[name], fit=fit)
 
 
 def video_sizes(size: tuple[int, int] | None) -> dict[str, tuple[int, int]]:

@@ -18,7 +18,7 @@ import torch
 from arena_newton import tasks as task_registry
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation, Policy, World
-from arena_newton.pictures.settings import CameraConfig
+from arena_newton.pictures.settings import CameraConfig, policy_cameras
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH, validate_action
 from arena_newton.rules import seeding
 from arena_newton.testing.findings import (
@@ -71,7 +71,7 @@ class _MadeUp:
     def __init__(self, policy: Policy, worlds: int, task: str):
         spec = task_registry.get(task)
         self.worlds, self.task, self.gym_id, self.instruction = worlds, task, spec.gym_id, spec.instruction
-        self.camera = (getattr(policy, "camera", None) or CameraConfig()) if policy.needs_image else None
+        self.cameras = policy_cameras(policy)
         self.seeds, self.ticks = np.zeros(worlds, np.int64), np.zeros(worlds, np.int64)
 
     def begin(self, seeds: Sequence[int], worlds: Sequence[int]) -> None:
@@ -79,21 +79,27 @@ class _MadeUp:
         self.ticks[list(worlds)] = 0
 
     def observe(self, asking: np.ndarray) -> Observation:
-        state, pictures = np.zeros((self.worlds, STATE_WIDTH), np.float32), []
+        state = np.zeros((self.worlds, STATE_WIDTH), np.float32)
+        sizes = {name: (self.worlds, camera.height, camera.width) for name, camera in self.cameras.items()}
+        images = {name: np.zeros((*size, 3), np.uint8) for name, size in sizes.items()}
+        depths = {name: np.zeros(size, np.float16) for name, size in sizes.items() if self.cameras[name].depth}
         for world, key in enumerate(zip(self.seeds.tolist(), self.ticks.tolist(), strict=True)):
             rng = np.random.default_rng(key)
             state[world] = 0.1 * rng.standard_normal(STATE_WIDTH)
             state[world, :6] += STAND_ACTION[3:9]
-            if self.camera is not None:
-                size = (self.camera.height, self.camera.width, 3)
-                pictures.append(rng.integers(0, 256, size, np.uint8))
+            for name, image in images.items():
+                image[world] = rng.integers(0, 256, image.shape[1:], np.uint8)
+                if name in depths:
+                    depths[name][world] = rng.uniform(0.0, 10.0, image.shape[1:3])
         return Observation(
             state=torch.from_numpy(state),
-            image=torch.from_numpy(np.stack(pictures)) if pictures else None,
+            image=None,
             mask=asking.copy(),
             task=self.task,
             gym_id=self.gym_id,
             instruction=self.instruction,
+            images={name: torch.from_numpy(image) for name, image in images.items()},
+            depths={name: torch.from_numpy(depth) for name, depth in depths.items()},
         )
 
     def play(self, actions: torch.Tensor, playing: np.ndarray) -> None:
@@ -104,7 +110,7 @@ class _Real:
     """Worlds of an environment; episodes may end there, which is not judged."""
 
     def __init__(self, policy: Policy, env: World):
-        self.env, self.image = env, policy.needs_image
+        self.env, self.image = env, bool(policy_cameras(policy))
         self.worlds, self.task, self.gym_id = env.worlds, env.spec.name, env.spec.gym_id
         policy.attach(env)
 
@@ -266,6 +272,9 @@ class _Trial:
         camera, size = getattr(policy, "camera", None), getattr(policy, "chunk_size", 1)
         if camera is not None and not isinstance(camera, CameraConfig):
             raise Violation(f"camera is a {type(camera).__name__}, expected a CameraConfig or None")
+        cameras = getattr(policy, "cameras", None)
+        if cameras is not None and not all(isinstance(one, CameraConfig) for one in dict(cameras).values()):
+            raise Violation("cameras is no mapping of names to CameraConfig")
         if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= MAX_CHUNK:
             raise Violation(f"chunk_size is {size!r}, expected a whole number from 1 to {MAX_CHUNK}")
         if not isinstance(getattr(policy, "depends_on_worlds", False), bool):
@@ -337,12 +346,12 @@ class _Trial:
         mask = np.ones(stage.worlds, dtype=bool)
         mask[ONLY] = False
         seen = stage.observe(mask)
-        state, image = seen.state.clone(), None if seen.image is None else seen.image.clone()
+        state, images = seen.state.clone(), {name: image.clone() for name, image in seen.images.items()}
         self.policy.act(seen)
         if not torch.equal(seen.state, state):
             raise Violation("act writes into observation.state, which is the world's own buffer")
-        if image is not None and (seen.image is None or not torch.equal(seen.image, image)):
-            raise Violation("act writes into observation.image, which the recorder keeps too")
+        if any(not torch.equal(seen.images[name], image) for name, image in images.items()):
+            raise Violation("act writes into observation.images, which the recorder keeps too")
         expected = np.arange(stage.worlds) != ONLY
         if not np.array_equal(seen.mask, expected):
             raise Violation("act writes into observation.mask")

@@ -96,7 +96,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         fast_physics: bool = False,
         image_size: Sequence[int] | None = IMAGE_SIZE,
         fit: Fit = "pad",
-        cameras: Mapping[str, str] | None = None,
+        cameras: Mapping[str, str | CameraConfig] | None = None,
         state_keys: Sequence[str] = ("agent_pos",),
         instruction: bool = True,
         startup: str = "steps",
@@ -123,8 +123,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             fast_physics: Use the tracker's fast physics rate.
             image_size: Width and height of observed pictures [px]; None: no pictures are taken, which is much faster.
             fit: `pad` or `native`, as in `CameraConfig`: how the camera's 4:3 picture goes into another size.
-            cameras: Name in `pixels` → camera (`ego`, `left_wrist`, `right_wrist`, `world` or a prim's path); by
-                default `pixels` is the head camera's picture itself.
+            cameras: Name in `pixels` → camera (`ego`, `left_wrist`, `right_wrist`, `world` or a prim's path), or one
+                with size and fit of its own; by default `pixels` is the head camera's picture itself.
             state_keys: Names under which the state is observed.
             instruction: Observe the instruction too, as `task`.
             startup: `steps`: an episode's start-up is ordinary steps whose action is ignored, and `info["startup"]`
@@ -155,7 +155,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         cap = None if max_episode_steps is None else _at_least_1("max_episode_steps", max_episode_steps)
         size = None if image_size is None else _size(image_size)
         _choice("fit", fit, get_args(Fit))
-        prims = {"": "ego"} if cameras is None else dict(cameras)
+        wanted = {"": "ego"} if cameras is None else cameras
         self.env = ArenaEnv(
             task,
             tracker=trackers.get(tracker, checkpoint) if isinstance(tracker, str) else tracker,
@@ -179,10 +179,13 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._named, self._instruction = cameras is not None, instruction
         self._cameras: dict[str, Camera] = {}
         if size is not None:
-            for name, prim in prims.items():
-                self._cameras[name] = self._camera(CameraConfig(width=size[0], height=size[1], prim=prim, fit=fit))
+            for name, one in wanted.items():
+                shown = one if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
+                if shown.depth:
+                    raise InputError(f"cameras: {name}: depth is not observed")
+                self._cameras[name] = Camera.of_config(self.env.scene, shown, self.env.lights)
         self._state_keys = tuple(state_keys)
-        self._make_spaces(size)
+        self._make_spaces()
         n = self.num_envs
         self._state = np.zeros((n, STATE_WIDTH), dtype=np.float32)
         self._pixels = {name: np.zeros((n, c.height, c.width, 3), np.uint8) for name, c in self._cameras.items()}
@@ -197,16 +200,13 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._outcome, self._reason = (np.full(n, "", dtype=object) for _ in range(2))
         self._margin = np.full(n, np.nan)
 
-    def _camera(self, config: CameraConfig) -> Camera:
-        size, lights = (config.width, config.height), self.env.lights
-        return Camera.from_scene(self.env.scene, config.prim, *size, lights=lights, fit=config.fit)
-
-    def _make_spaces(self, size: tuple[int, int] | None) -> None:
+    def _make_spaces(self) -> None:
         """Spaces of one world and of the batch."""
         state = {name: spaces.Box(-np.inf, np.inf, (STATE_WIDTH,), np.float32) for name in self._state_keys}
         parts: dict[str, spaces.Space] = dict(state)
-        if size is not None and self._cameras:
-            pictures = {name: spaces.Box(0, 255, (size[1], size[0], 3), np.uint8) for name in self._cameras}
+        if self._cameras:
+            sizes = {name: (camera.height, camera.width, 3) for name, camera in self._cameras.items()}
+            pictures = {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in sizes.items()}
             parts["pixels"] = spaces.Dict(dict(pictures)) if self._named else pictures[""]
         if self._instruction:
             letters = string.ascii_letters + string.digits + string.punctuation + " "
@@ -442,8 +442,8 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         if self._pixels:
             return tuple(next(iter(self._pixels.values())).copy())
         if self._film is None:
-            width, height = STRIP_SIZES["world"]
-            self._film = self._camera(CameraConfig(width=width, height=height, prim="world", fit="native"))
+            film = CameraConfig(*STRIP_SIZES["world"], "world", "native")
+            self._film = Camera.of_config(self.env.scene, film, self.env.lights)
         pictures = self.env.render(self._film, self._unfilmed).cpu().numpy()
         self._unfilmed[:] = False
         return tuple(pictures.copy())

@@ -18,6 +18,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
 from arena_newton.interfaces import Disturbance, EpisodeResult, Recorder
+from arena_newton.pictures.settings import policy_cameras
 from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
@@ -164,7 +165,7 @@ class RepeatedEpisodes:
             worlds=worlds or len(self.episodes),
             engine="warp" if cuda else "mujoco",
             device="cuda:0" if cuda else "cpu",
-            camera=policy.camera if policy.needs_image else None,
+            cameras=policy_cameras(policy),
         )
 
     def play(

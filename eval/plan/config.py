@@ -17,7 +17,6 @@ from arena_newton import __version__, policies, rule_sets, trackers
 from arena_newton import tasks as task_specs
 from arena_newton.cli.flags import check_least, shared
 from arena_newton.data.readers.looks import MOST_LIGHTS
-from arena_newton.data.recording.episode import CAMERAS
 from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
@@ -49,7 +48,14 @@ from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.physics.devices import cluster_engine, resolve_engine
-from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig, Fit, robot_fit, video_sizes
+from arena_newton.pictures.settings import (
+    CAMERAS,
+    SIZE_LIMITS,
+    CameraConfig,
+    policy_cameras,
+    recorded_camera,
+    video_sizes,
+)
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.rules import seeding
@@ -122,8 +128,8 @@ class RunConfig:
     """Recorded cameras by name; None where nothing is recorded."""
     labels: str = "v3.1"
     """Protocol of the policy's actions; final when the policy was made."""
-    camera: CameraConfig | None = None
-    """Camera that the policy asks for; None for one that does not see."""
+    cameras: Mapping[str, CameraConfig] = dataclasses.field(default_factory=dict)
+    """Cameras that the policy asks for, by name; none for one that does not see."""
     worlds_matter: bool = False
     """True if the policy depends on how many worlds ask at once; known when it was made and checked."""
     tracker_facts: JsonObject | None = None
@@ -219,7 +225,7 @@ class RunConfig:
         """The run with what its trackers, by name, and its policy say of themselves."""
         return dataclasses.replace(
             self,
-            camera=(policy.camera or CameraConfig()) if policy.needs_image else None,
+            cameras=policy_cameras(policy),
             labels=self.flags.labels or getattr(policy, "labels", None) or "v3.1",
             worlds_matter=policy.depends_on_worlds,
             tracker_facts={name: _facts(tracker) for name, tracker in made.items()},
@@ -442,8 +448,7 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
             raise InputError(f"{flag}cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
         if name in found:
             raise InputError(f"{flag}cameras {name}: given twice")
-        fit: Fit = "native" if name == "world" else robot_fit(width, height)
-        found[name] = CameraConfig(width=width, height=height, prim="ego" if name == "front" else name, fit=fit)
+        found[name] = recorded_camera(name, width, height)
     return found
 
 

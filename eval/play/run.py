@@ -165,7 +165,7 @@ def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: 
         mode=episode.mode,
         variant_file=str(config.variant) if config.variant else None,
         fast_physics=flags.fast_physics,
-        camera=config.camera,
+        cameras=config.cameras,
         drive=DRIVES[flags.drive],
     )
 

@@ -21,15 +21,12 @@ from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records.identity import hash_path
 from arena_newton.interfaces import Observation
-from arena_newton.pictures.settings import CameraConfig
+from arena_newton.pictures.settings import FRONT, CameraConfig, policy_cameras
 from arena_newton.policies.base import DATASET_FILE, Policy
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 from arena_newton.rules import seeding
 
-__all__ = ["FRONT", "DatasetObservations", "Samples", "as_many_of_each", "predict"]
-
-FRONT = "observation.images.front"
-"""Feature of the head camera's pictures."""
+__all__ = ["DatasetObservations", "Samples", "as_many_of_each", "predict"]
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ class DatasetObservations:
         """The tracker that all its episodes were recorded through; empty where it is not one."""
         self.name = self.tracker or self.root.name
         """That tracker, or the folder's name."""
-        self._frames: Frames | None = None
+        self._frames: dict[str, Frames] = {}
 
     @property
     def digest(self) -> str:
@@ -118,16 +115,16 @@ class DatasetObservations:
             np.concatenate(states)[:number],
         )
 
-    def pictures(self, rows: Sequence[int], camera: CameraConfig) -> np.ndarray:
-        """Front pictures of rows, uint8, shape [n, H, W, 3].
+    def pictures(self, rows: Sequence[int], camera: CameraConfig, name: str = FRONT) -> np.ndarray:
+        """Pictures of rows by a camera, the head camera by default, uint8, shape [n, H, W, 3].
 
         Raises:
             InputError: The dataset has none, or of another size than the policy wants; of padded ones the part within
                 the pad is taken for a policy that wants it.
         """
-        if self._frames is None:
-            self._frames = Frames(self.root, FRONT)
-        found = np.stack([self._frames[row] for row in rows])
+        if name not in self._frames:
+            self._frames[name] = Frames(self.root, f"observation.images.{name}")
+        found = np.stack([self._frames[name][row] for row in rows])
         if 3 * camera.width == 4 * camera.height and found.shape[1] == found.shape[2] == camera.width:
             top = (camera.width - camera.height) // 2
             found = found[:, top : top + camera.height]
@@ -141,8 +138,8 @@ class DatasetObservations:
 
     def close(self) -> None:
         """Close its videos."""
-        if self._frames is not None:
-            self._frames.close()
+        for frames in self._frames.values():
+            frames.close()
 
 
 def as_many_of_each(datasets: Sequence[DatasetObservations], task: str, number: int, per_episode: int) -> list[Samples]:
@@ -177,27 +174,28 @@ def predict(
     """
     spec = tasks.get(samples.task)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    camera = policy.camera or CameraConfig()
+    cameras = policy_cameras(policy)
     found = np.zeros((len(samples), ACTION_WIDTH), dtype=np.float32)
     for first in range(0, len(samples), batch):
         some = np.arange(first, min(first + batch, len(samples)))
         filled = np.concatenate([some, np.full(batch - len(some), some[0])])
-        image = None
-        if policy.needs_image:
-            shown = data.pictures(samples.rows[some].tolist(), camera)
+        images = {}
+        for name, camera in cameras.items():
+            shown = data.pictures(samples.rows[some].tolist(), camera, name)
             shown = np.concatenate([shown, np.repeat(shown[:1], batch - len(some), axis=0)])
-            image = torch.as_tensor(shown, device=device)
+            images[name] = torch.as_tensor(shown, device=device)
         # Of each observation its own, and the same for observation k of both datasets.
         seeds = [seeding.recording_seed(spec.gym_id, seeding.DEMONSTRATION, seed, int(k)) for k in filled]
         policy.reset(seeds, [spec.gym_id] * batch)
         observation = Observation(
             state=torch.as_tensor(samples.states[filled], device=device),
-            image=image,
+            image=None,
             mask=np.ones(batch, dtype=bool),
             task=samples.task,
             gym_id=spec.gym_id,
             instruction=spec.instruction,
             tracker=data.tracker,
+            images=images,
         )
         try:
             answer = policy.act(observation)

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.pictures.settings import FRONT
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, hub_name, world_mask
 from arena_newton.policies.lerobot.checkpoint_network import PolicyNetwork
 from arena_newton.policies.lerobot.checkpoint_reader import (
     FAMILY_TYPES,
-    FRONT,
+    IMAGES,
     STATE,
     TASK_VECTOR,
     PolicyCheckpoint,
@@ -72,8 +73,8 @@ class LeRobotPolicy(Policy):
             replan = ENSEMBLE_TICKS if ensemble else self.checkpoint.executed
         elif not 1 <= replan <= predicted:
             raise InputError(f"--replan {replan}: expected 1 to {predicted}, which {self.checkpoint.folder} predicts")
-        self.needs_image = self.checkpoint.camera is not None
-        self.camera = self.checkpoint.camera
+        self.cameras = dict(self.checkpoint.cameras)
+        self.needs_image, self.camera = bool(self.cameras), self.cameras.get(FRONT)
         self.labels = facts.labels
         self.realign = facts.realign
         self.chunk_size = replan
@@ -150,7 +151,7 @@ class LeRobotPolicy(Policy):
     def describe(self) -> Json:
         """Family, weights and what the checkpoint says of itself, and how its answers are executed."""
         checkpoint, facts = self.checkpoint, self.checkpoint.facts
-        picture = None if self.camera is None else [self.camera.width, self.camera.height, self.camera.fit]
+        pictures = {name: [one.width, one.height, one.fit] for name, one in self.checkpoint.cameras.items()}
         return {
             "name": self.name,
             "family": facts.family,
@@ -167,7 +168,8 @@ class LeRobotPolicy(Policy):
             "realign": facts.realign,
             "task_vector": list(facts.task_vector),
             **({"tracker_vector": list(facts.tracker_vector)} if facts.tracker_vector else {}),
-            "picture": picture,
+            "picture": pictures.get(FRONT),
+            **({"pictures": pictures} if {*pictures} - {FRONT} else {}),
             "prepared": checkpoint.preparation is not None,
             "observations": checkpoint.observations,
             "predicted": checkpoint.predicted,
@@ -205,17 +207,15 @@ class LeRobotPolicy(Policy):
 
     def _glimpse(self, seen: Observation, worlds: Sequence[int], device: torch.device, memory: ChunkMemory) -> None:
         """Remember what the worlds that ask show; the observation's own buffers are overwritten by the next one."""
-        pictures: torch.Tensor | None = None
-        if self.camera is not None:
-            size = (self.camera.height, self.camera.width, 3)
-            if seen.image is None or tuple(seen.image.shape[1:]) != size:
-                given = "none" if seen.image is None else str(list(seen.image.shape[1:]))
-                raise InputError(f"policy {self.name}: expected pictures of {list(size)}, was given {given}")
-            pictures = seen.image
+        for name, camera in self.checkpoint.cameras.items():
+            size, image = [camera.height, camera.width, 3], seen.images.get(name)
+            if image is None or list(image.shape[1:]) != size:
+                given = "none" if image is None else str(list(image.shape[1:]))
+                raise InputError(f"policy {self.name}, camera {name}: expected pictures of {size}, was given {given}")
         for world in worlds:
             glimpse = {STATE: seen.state[world].to(device, torch.float32, copy=True)}
-            if pictures is not None:
-                glimpse[FRONT] = pictures[world].to(device, copy=True)
+            for name in self.checkpoint.cameras:
+                glimpse[IMAGES + name] = seen.images[name][world].to(device, copy=True)
             memory.glimpse(world, glimpse)
 
     def _predict(
@@ -234,14 +234,14 @@ class LeRobotPolicy(Policy):
         several = ticks > 1 or self.checkpoint.type in TICKS_TYPES
         states = [[one[STATE] for one in query] for query in queries]
         seen: dict[str, torch.Tensor] = {STATE: self._stacked(states, several)}
-        if self.camera is not None:
-            pictures = self._stacked([[one[FRONT] for one in query] for query in queries], True)
+        for key in (IMAGES + name for name in self.checkpoint.cameras):
+            pictures = self._stacked([[one[key] for one in query] for query in queries], True)
             flat = pictures.flatten(0, 1)
             if self.checkpoint.preparation is not None:
                 flat = self.checkpoint.preparation(flat)
             values = flat.permute(0, 3, 1, 2).to(torch.float32) / 255.0
             values = values.reshape(rows, ticks, *values.shape[1:])
-            seen[FRONT] = (values if several else values[:, 0]).contiguous()
+            seen[key] = (values if several else values[:, 0]).contiguous()
         if vector is not None:
             repeated = vector.expand(rows, ticks, -1)
             seen[TASK_VECTOR] = (repeated if several else repeated[:, 0]).contiguous()

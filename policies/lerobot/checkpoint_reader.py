@@ -21,7 +21,7 @@ from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
 from arena_newton.files.stored_json import read_object
 from arena_newton.files.untrusted_files import check_size, file_digest
-from arena_newton.pictures.settings import CameraConfig, robot_fit
+from arena_newton.pictures.settings import CAMERAS, CameraConfig, Fit, recorded_camera
 from arena_newton.policies.lerobot.checkpoint_facts import (
     CONFIG_FILE,
     FACTS_FILE,
@@ -35,7 +35,7 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 __all__ = [
     "FAMILY_TYPES",
-    "FRONT",
+    "IMAGES",
     "STATE",
     "TASK_VECTOR",
     "WEIGHTS",
@@ -44,8 +44,8 @@ __all__ = [
     "read_checkpoint",
 ]
 
-FRONT = "observation.images.front"
-"""Key of the head camera's picture."""
+IMAGES = "observation.images."
+"""Beginning of the key of a camera's picture, before its name (`pictures.settings.CAMERAS`)."""
 STATE = "observation.state"
 """Key of the canonical state."""
 TASK_VECTOR = "observation.environment_state"
@@ -94,10 +94,10 @@ class PolicyCheckpoint:
     """LeRobot's configuration of the policy; nothing in it makes LeRobot download or compile."""
     facts: CheckpointFacts
     """Facts that it gives; a foreign one gets actions of v3.1."""
-    camera: CameraConfig | None
-    """The picture that is rendered; None for a policy without pictures."""
+    cameras: Mapping[str, CameraConfig]
+    """Pictures that are rendered, by the names of their cameras; none for a policy without pictures."""
     preparation: PicturePreparation | None
-    """Preparation of the picture before LeRobot's processors, in checkpoints of the original."""
+    """Preparation of pictures before LeRobot's processors, in checkpoints of the original."""
     digest: str
     """First 12 hex digits of the SHA-256 of the weights."""
     ignored: tuple[str, ...] = ()
@@ -165,15 +165,14 @@ def read_checkpoint(path: Path) -> PolicyCheckpoint:
     own = CheckpointFacts.read(folder)
     facts = own or CheckpointFacts(family=FAMILY_TYPES[kind])
     renamed = _processors(folder, config)
-    picture = _features(folder, config, facts, own is not None, renamed)
-    camera, preparation = None, None
-    if picture is not None:
-        preparation = PicturePreparation.read(folder) if own is None else None
-        camera = facts.camera if own is not None else _foreign_camera(picture, preparation)
+    pictures = _features(folder, config, facts, own is not None, renamed)
+    preparation = PicturePreparation.read(folder) if pictures and own is None else None
+    fit = None if own is None else facts.camera.fit
+    cameras = {name: _camera(name, size, preparation, fit) for name, size in pictures.items()}
     check_family(folder / WEIGHTS, kind)
     check_layers(folder / WEIGHTS, kind, config)
     digest = file_digest(folder / WEIGHTS, MOST_WEIGHTS)
-    return PolicyCheckpoint(folder, config, facts, camera, preparation, digest, ignored)
+    return PolicyCheckpoint(folder, config, facts, cameras, preparation, digest, ignored)
 
 
 def _configuration(path: Path, kind: str, content: Mapping[str, object]) -> tuple[PreTrainedConfig, tuple[str, ...]]:
@@ -269,21 +268,22 @@ def _modes(registered: str, config: PreTrainedConfig) -> dict[str, str]:
 
 def _features(
     folder: Path, config: PreTrainedConfig, facts: CheckpointFacts, own: bool, renamed: Mapping[str, str]
-) -> tuple[int, int] | None:
-    """Check observations and actions; returns height and width of the picture, None for a policy without one."""
+) -> dict[str, tuple[int, int]]:
+    """Check observations and actions; returns height and width of the picture of each camera."""
     path = folder / CONFIG_FILE
     outputs, inputs = dict(config.output_features or {}), dict(config.input_features or {})
     action = outputs.get("action")
     if action is None or tuple(action.shape) != (ACTION_WIDTH,):
         raise InputError(f"{path}: output action is {_shape(action)}, expected [{ACTION_WIDTH}]")
-    ours = {renamed.get(name, name): name for name in (STATE, FRONT, TASK_VECTOR)}
-    picture = None
+    shown = {f"{IMAGES}{name}": name for name in CAMERAS}
+    ours = {renamed.get(name, name): name for name in (STATE, TASK_VECTOR, *shown)}
+    pictures: dict[str, tuple[int, int]] = {}
     for name, feature in inputs.items():
         given, shape = ours.get(name), tuple(feature.shape)
         if given == STATE and shape == (STATE_WIDTH,):
             continue
-        if given == FRONT and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
-            picture = (int(shape[1]), int(shape[2]))
+        if given in shown and feature.type is FeatureType.VISUAL and len(shape) == 3 and shape[0] == 3:
+            pictures[shown[given]] = (int(shape[1]), int(shape[2]))
             continue
         if given == TASK_VECTOR and facts.task_vector and shape == (facts.vector_width,):
             continue
@@ -293,26 +293,29 @@ def _features(
             trackers = f" and {len(facts.tracker_vector)} trackers" if facts.tracker_vector else ""
             message = f"{FACTS_FILE} names {len(facts.task_vector)} tasks{trackers} for it"
             raise InputError(f"{path}: input {name} is {_shape(feature)}, but {message}")
-        known = f"{STATE} [{STATE_WIDTH}], {FRONT} [3, height, width] and {TASK_VECTOR}"
+        known = f"{STATE} [{STATE_WIDTH}], {TASK_VECTOR}, and of [3, height, width] {', '.join(shown)}"
         raise InputError(f"{path}: input {name} {_shape(feature)} is not observed here; what is: {known}")
     for name in (STATE, *((TASK_VECTOR,) if facts.task_vector else ())):
         if renamed.get(name, name) not in inputs:
             raise InputError(f"{path}: has no input {renamed.get(name, name)}, which every policy here is given")
-    if own and picture is not None and picture != (facts.height, facts.width):
-        text = f"{FACTS_FILE} says {facts.width}x{facts.height}"
-        raise InputError(f"{path}: pictures are {picture[1]}x{picture[0]}, but {text}")
-    return picture
+    for height, width in pictures.values():
+        if own and (height, width) != (facts.height, facts.width):
+            text = f"{FACTS_FILE} says {facts.width}x{facts.height}"
+            raise InputError(f"{path}: pictures are {width}x{height}, but {text}")
+    return pictures
 
 
 def _shape(feature: PolicyFeature | None) -> str:
     return "absent" if feature is None else str(list(feature.shape))
 
 
-def _foreign_camera(picture: tuple[int, int], preparation: PicturePreparation | None) -> CameraConfig:
-    """Camera for somebody else's policy: the picture for the original's server, or the size that it was trained on."""
+def _camera(
+    name: str, picture: tuple[int, int], preparation: PicturePreparation | None, fit: Fit | None
+) -> CameraConfig:
+    """Camera for a policy: the picture for the original's server, or the size that the policy was trained on."""
     if preparation is not None:
-        return CameraConfig(width=NATIVE[0], height=NATIVE[1], fit="native")
+        return recorded_camera(name, *NATIVE)
     height, width = picture
     if not all(16 <= n <= 4096 for n in picture):
         raise InputError(f"pictures of {width}x{height} pixels, expected 16 to 4096 each")
-    return CameraConfig(width=width, height=height, fit=robot_fit(width, height))
+    return recorded_camera(name, width, height, fit)

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from arena_newton.files.text import plain_text
+from arena_newton.pictures.settings import CAMERAS
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.policy_messages import (
     MAX_SEED,
@@ -99,9 +100,8 @@ def pack_begun(facts: ServedFacts) -> bytes:
 def pack_query(query: Query) -> bytes:
     """Body of `/infer`."""
     seen: dict[str, object] = {"state": [float(v) for v in query.state]}
-    if query.image is not None:
-        data = base64.b64encode(np.ascontiguousarray(query.image).tobytes()).decode("ascii")
-        seen["images"] = {"front": {"shape": list(query.image.shape), "dtype": "uint8", "data_b64": data}}
+    if query.images:
+        seen["images"] = {name: _packed(np.asarray(image)) for name, image in query.images.items()}
     content: dict[str, object] = {"observation": seen, "robot_type": query.robot_type, "return_chunk": True}
     content |= {"task": query.task, "instruction": query.instruction}
     more = {"world": int(query.session) if query.session else None, "step": query.step, "seed": query.seed}
@@ -122,12 +122,16 @@ def unpack_query(body: bytes | bytearray) -> tuple[Query, bool]:
     pictures = seen.get("images") or {}
     if not isinstance(pictures, dict):
         raise WireError(f"{where}: images is {_kind(pictures)}, expected an object")
-    picture, chunk = pictures.get("front"), content.get("return_chunk", False)
+    chunk = content.get("return_chunk", False)
     if not isinstance(chunk, bool):
         raise WireError(f"{where}: return_chunk is {_kind(chunk)}, expected true or false")
     query = Query(
         state=read_state(seen.get("state"), where),
-        image=None if picture is None else _picture(picture, where),
+        images={
+            name: _picture(pictures[name], f"{where}: images.{name}", where)
+            for name in CAMERAS
+            if pictures.get(name) is not None
+        },
         task=read_text(content.get("task"), where, "task"),
         instruction=read_text(content.get("instruction"), where, "instruction"),
         session=_world(content, where),
@@ -233,22 +237,27 @@ def _world(content: dict[str, object], where: str) -> str:
     return "" if world is None else str(world)
 
 
-def _picture(value: object, where: str) -> np.ndarray:
+def _packed(image: np.ndarray) -> dict[str, object]:
+    data = base64.b64encode(np.ascontiguousarray(image).tobytes()).decode("ascii")
+    return {"shape": list(image.shape), "dtype": "uint8", "data_b64": data}
+
+
+def _picture(value: object, name: str, where: str) -> np.ndarray:
     if not isinstance(value, dict):
-        raise WireError(f"{where}: images.front is {_kind(value)}, expected an object")
+        raise WireError(f"{name} is {_kind(value)}, expected an object")
     coded = value.get("data_b64")
     if not isinstance(coded, str) or len(coded) > MAX_FRAME:
-        raise WireError(f"{where}: images.front.data_b64 is {_kind(coded)}, expected base64")
+        raise WireError(f"{name}.data_b64 is {_kind(coded)}, expected base64")
     dtype = value.get("dtype", "uint8")
     if dtype not in ("uint8", "float32"):
-        raise WireError(f"{where}: images.front.dtype is {plain_text(dtype, 20)!r}, expected uint8 or float32")
+        raise WireError(f"{name}.dtype is {plain_text(dtype, 20)!r}, expected uint8 or float32")
     try:
         data = base64.b64decode(coded, validate=True)
     except (binascii.Error, ValueError):
-        raise WireError(f"{where}: images.front.data_b64 is not base64") from None
-    picture = checked_array(data, dtype, value.get("shape"), f"{where}: images.front")
+        raise WireError(f"{name}.data_b64 is not base64") from None
+    picture = checked_array(data, dtype, value.get("shape"), name)
     if dtype == "float32":  # the original's server divides these by 255, too
         if not ((picture >= 0.0) & (picture <= 255.0) & (picture == np.rint(picture))).all():
-            raise WireError(f"{where}: images.front of float32 holds other than whole numbers from 0 to 255")
+            raise WireError(f"{name} of float32 holds other than whole numbers from 0 to 255")
         picture = picture.astype(np.uint8)
     return read_picture(picture, where)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Literal
 
 from arena_newton.data.readers.label_protocols import LABELS, action_names
@@ -16,6 +16,7 @@ from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import InputError
 from arena_newton.files.stored_json import Fit, Known, loaded
 from arena_newton.files.text import plain_text
+from arena_newton.pictures.settings import CAMERAS, CameraConfig
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, PICTURE_SIDES
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.robot import g1
@@ -42,6 +43,7 @@ def _is_json(value: object) -> bool:
 Side = Annotated[int, Fit("pixels", lambda value: PICTURE_SIDES[0] <= value <= PICTURE_SIDES[1])]
 Names = Annotated[tuple[str, ...], Fit("a list of names", lambda value: len(value) <= MOST_NAMES)]
 Length = Annotated[int, Fit("a number of actions", lambda value: 0 <= value <= LONGEST_CHUNK)]
+Camera = Annotated[str, Known(lambda: CAMERAS)]
 Labels = Annotated[str, Known(lambda: LABELS)]
 Facts = Annotated[Mapping[str, object], Fit("a JSON object", _is_json)]
 
@@ -56,6 +58,16 @@ class ServedPicture:
     """[px]"""
     fit: Literal["pad", "native"] = "pad"
     """`pad` or `native`, as in `CameraConfig`."""
+
+    @classmethod
+    def of(cls, camera: CameraConfig) -> ServedPicture:
+        """The picture of a camera."""
+        return cls(camera.width, camera.height, camera.fit)
+
+    @property
+    def camera(self) -> CameraConfig:
+        """A camera whose picture it is."""
+        return CameraConfig(width=self.width, height=self.height, fit=self.fit)
 
 
 @dataclass(frozen=True)
@@ -80,7 +92,9 @@ class ServedFacts:
     needs_picture: bool | None = None
     """True if the policy observes pictures."""
     picture: ServedPicture | None = None
-    """The picture that it looks at; pictures of other sizes are resized by the server."""
+    """The head camera's picture that it looks at; pictures of other sizes are resized by the server."""
+    cameras: Mapping[Camera, ServedPicture] | None = None
+    """The picture of each camera, where they are not the head camera's alone."""
     batched: bool = False
     """True if one request may hold several robots, along a leading axis."""
     seeded: bool = False
@@ -90,7 +104,6 @@ class ServedFacts:
 
     def to_json(self) -> dict[str, object]:
         """The record as JSON; what is not declared is left out."""
-        picture = self.picture and {"width": self.picture.width, "height": self.picture.height, "fit": self.picture.fit}
         content: dict[str, object] = {
             "arena": HANDSHAKE_VERSION,
             "policy": self.policy,
@@ -101,7 +114,8 @@ class ServedFacts:
             "chunk_length": self.chunk_length,
             "rate_hz": self.rate_hz,
             "needs_picture": self.needs_picture,
-            "picture": picture,
+            "picture": self.picture and asdict(self.picture),
+            "cameras": self.cameras and {name: asdict(one) for name, one in self.cameras.items()},
             "batched": self.batched,
             "seeded": self.seeded,
             "facts": dict(self.facts),
@@ -116,7 +130,7 @@ class ServedFacts:
             "state names": self.state_names,
             "chunk length": self.chunk_length,
             "rate": self.rate_hz,
-            "picture": self.needs_picture if self.needs_picture is not True else self.picture,
+            "picture": self.needs_picture if self.needs_picture is not True else self.cameras or self.picture,
         }
         return [name for name, value in facts.items() if value is None]
 
@@ -146,15 +160,23 @@ def read_facts(content: object, where: str) -> ServedFacts:
         version = plain_text(content["arena"], 40)
         raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
     declared = {key: value for key, value in content.items() if value is not None}
-    if isinstance(picture := declared.get("picture"), Mapping):  # of later versions it may say more
-        known = ServedPicture.__dataclass_fields__
-        declared["picture"] = {key: value for key, value in picture.items() if key in known}
+    if "picture" in declared:
+        declared["picture"] = _known(declared["picture"])
+    if isinstance(cameras := declared.get("cameras"), Mapping):
+        declared["cameras"] = {name: _known(one) for name, one in cameras.items()}
     try:
         facts = loaded(f"{where}: the server declares", declared, ServedFacts)
     except InputError as error:
         raise WireError(str(error)) from None
     realign, rate = (None if number is None else float(number) for number in (facts.realign, facts.rate_hz))
     return replace(facts, policy=plain_text(facts.policy, 200), realign=realign, rate_hz=rate)
+
+
+def _known(picture: object) -> object:
+    """A picture's entries that we know: of later versions it may say more."""
+    if not isinstance(picture, Mapping):
+        return picture
+    return {key: value for key, value in picture.items() if key in ServedPicture.__dataclass_fields__}
 
 
 def compare_facts(declared: ServedFacts, wanted: ServedFacts, where: str) -> None:

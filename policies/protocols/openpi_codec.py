@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from arena_newton.files.text import plain_text
+from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, Value, WireError, pack, unpack
 from arena_newton.policies.protocols.policy_messages import (
@@ -34,6 +35,7 @@ __all__ = [
     "PROMPT_KEY",
     "RESET_ANSWER",
     "STATE_KEY",
+    "camera_key",
     "pack_answer",
     "pack_metadata",
     "pack_request",
@@ -50,6 +52,8 @@ STATE_KEY = "observation/state"
 """Key of the 64 numbers of the state."""
 PROMPT_KEY = "prompt"
 """Key of the instruction."""
+_CAMERA_KEYS = {name: f"observation/{name}_image" for name in CAMERAS if name != FRONT}
+"""Keys of the pictures of the other cameras."""
 RESET_ANSWER = "reset successful"
 """Text frame with which RoboArena's server answers `reset`."""
 WHERE = "request"
@@ -66,7 +70,7 @@ def pack_metadata(facts: ServedFacts, *, roboarena: bool = False) -> bytes:
     size = facts.picture and [facts.picture.height, facts.picture.width]
     content: dict[str, object] = {
         "image_resolution": size,
-        "needs_wrist_camera": False,
+        "needs_wrist_camera": any("wrist" in name for name in facts.cameras or ()),
         "n_external_cameras": int(bool(facts.needs_picture)),
         "needs_stereo_camera": False,
         "needs_session_id": True,
@@ -85,6 +89,11 @@ def unpack_metadata(data: bytes | str, where: str) -> tuple[ServedFacts, Mapping
     return read_facts(content, where), content
 
 
+def camera_key(name: str, front: str = IMAGE_KEY) -> str:
+    """Key of a camera's picture; `front` is that of the head camera's."""
+    return _CAMERA_KEYS.get(name, front)
+
+
 def pack_request(
     request: Query | Begin, *, roboarena: bool = False, image_key: str = IMAGE_KEY, extras: bool = True
 ) -> bytes:
@@ -93,7 +102,7 @@ def pack_request(
     Args:
         request: openpi itself knows no beginning of an episode: there `seed` and `step` 0 of a query begin one.
         roboarena: Name endpoint and session.
-        image_key: Key of the picture.
+        image_key: Key of the head camera's picture.
         extras: Add `task`, `seed` and `step`, which servers other than ours do not read.
 
     Raises:
@@ -101,8 +110,8 @@ def pack_request(
     """
     content: dict[str, object] = {}
     if isinstance(request, Query):
-        if request.image is not None:
-            content[image_key] = np.ascontiguousarray(request.image)
+        for name, image in request.images.items():
+            content[camera_key(name, image_key)] = np.ascontiguousarray(image)
         content[STATE_KEY] = np.ascontiguousarray(request.state, dtype=np.float32)
         content[PROMPT_KEY] = request.instruction
     elif not roboarena:
@@ -140,10 +149,10 @@ def unpack_request(data: bytes | str) -> tuple[Query | Begin, bool]:
     prompt = read_text(content.get(PROMPT_KEY), WHERE, PROMPT_KEY)
     if endpoint == "reset":
         return Begin(named, seed, task, prompt), True
-    pictures = [content[key] for key in IMAGE_KEYS if key in content]
+    keys = {FRONT: next((key for key in IMAGE_KEYS if key in content), IMAGE_KEY), **_CAMERA_KEYS}
     query = Query(
         state=read_state(content.get(STATE_KEY), WHERE),
-        image=read_picture(pictures[0], WHERE) if pictures else None,
+        images={name: read_picture(content[key], WHERE) for name, key in keys.items() if key in content},
         task=task,
         instruction=prompt,
         session=named,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arena_newton.pictures.settings import FRONT
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
@@ -64,8 +65,9 @@ class Query:
 
     state: np.ndarray
     """Canonical state, float32, shape [64]."""
-    image: np.ndarray | None = None
-    """Head camera, uint8, shape [H, W, 3], red first."""
+    images: Mapping[str, np.ndarray | PackedPicture] = field(default_factory=dict)
+    """Picture of each camera by its name (`pictures.settings.CAMERAS`), uint8, shape [H, W, 3], red first; or as its
+    sender packed it."""
     task: str = ""
     """As in `Begin`."""
     instruction: str = ""
@@ -77,8 +79,11 @@ class Query:
     """Actions that the episode has executed so far; None: not given."""
     robot_type: str = ""
     """The label protocol's `robot_type` that the robot executes; empty: not given."""
-    packed: PackedPicture | None = None
-    """The picture as its sender packed it, instead of `image`."""
+
+    @property
+    def image(self) -> np.ndarray | PackedPicture | None:
+        """The head camera's picture."""
+        return self.images.get(FRONT)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from PIL import Image
 
 from arena_newton import __version__
 from arena_newton.files.text import plain_text
+from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.packed_arrays import TEXT_KEYS, Value, WireError, checked_array, pack, unpack
 from arena_newton.policies.protocols.packed_picture import PICTURE_FORMATS, PackedPicture
@@ -58,8 +59,6 @@ TYPES = ("hello", "observation", "action", "episode_start", "episode_end", "erro
 """Types of messages."""
 CHUNKS = "chunks"
 """Capability of a robot that executes whole chunks, and of a server that gives them."""
-CAMERA = "front"
-"""Name of the head camera among the pictures."""
 WHERE = "message"
 """Name of a message in errors."""
 LARGEST_SEQ = 2**63 - 1
@@ -151,7 +150,7 @@ def pack_request(request: Request, seq: int, timestamp: float, images: ImageForm
     match request:
         case Query():
             payload = {"task_description": request.instruction, "states": request.state.astype(np.float32)}
-            payload["images"] = {} if request.image is None else {CAMERA: np.ascontiguousarray(request.image)}
+            payload["images"] = {name: np.ascontiguousarray(image) for name, image in request.images.items()}
             more = {"step": request.step, "seed": request.seed, "task": request.task or None}
             kind = "observation"
         case Begin():
@@ -186,14 +185,17 @@ def unpack_request(message: VlaEvalMessage) -> Request:
     pictures = payload.get("images", {})
     if not isinstance(pictures, dict):
         raise WireError(f"{WHERE}: images is {type(pictures).__name__}, expected a map")
-    if len(pictures) > 1 and CAMERA not in pictures:
-        raise WireError(f"{WHERE}: several pictures, and none is named {CAMERA}")
-    picture: object = pictures.get(CAMERA, next(iter(pictures.values()), None))
-    packed = picture if isinstance(picture, PackedPicture) else None
+    known = {name: pictures[name] for name in CAMERAS if name in pictures}
+    if not known and len(pictures) > 1:
+        raise WireError(f"{WHERE}: several pictures, and none is named {FRONT}")
+    known = known or {FRONT: next(iter(pictures.values()), None)}
     return Query(
         state=read_state(payload.get("states"), WHERE),
-        image=None if picture is None or packed is not None else read_picture(picture, WHERE),
-        packed=packed,
+        images={
+            name: one if isinstance(one, PackedPicture) else read_picture(one, WHERE)
+            for name, one in known.items()
+            if one is not None
+        },
         task=task,
         instruction=instruction,
         session=session,

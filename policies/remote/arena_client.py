@@ -29,7 +29,7 @@ from arena_newton.policies.protocols import arena_codec
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import TOKEN_VARIABLE, read_address
-from arena_newton.policies.remote.client import MAX_FAILURES, MAX_REPLY, RemoteClient
+from arena_newton.policies.remote.client import MAX_FAILURES, MAX_REPLY, Images, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink, episode_lost
 
 __all__ = ["MAX_FAILURES", "MAX_REPLY", "ROBOT_TYPE", "TOKEN_VARIABLE", "RemotePolicy", "from_spec"]
@@ -216,8 +216,8 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
     def _beginning(self, world: int, task: str) -> bytes | None:
         return arena_codec.pack_begin(self._begin(world, task))
 
-    def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        return arena_codec.pack_query(self._query(seen, state, image, world))
+    def _request(self, seen: Observation, state: np.ndarray, images: Images, world: int) -> bytes:
+        return arena_codec.pack_query(self._query(seen, state, images, world))
 
     def _rows(self, content: object) -> np.ndarray:
         return self.checked(arena_codec.chunk_of(_object(content), f"{self.url}/infer"))

@@ -15,14 +15,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
 
 from arena_newton.data.readers.label_protocols import LABELS, protocol
 from arena_newton.errors import InputError
-from arena_newton.pictures.camera import CameraConfig
+from arena_newton.pictures.settings import CameraConfig, policy_cameras
 from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, PolicyUnavailable, world_mask
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, compare_facts, expected_facts
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Query
@@ -34,6 +34,7 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE, STAT
 __all__ = [
     "MAX_FAILURES",
     "MAX_REPLY",
+    "Images",
     "RemoteClient",
     "standing_state",
 ]
@@ -44,6 +45,10 @@ MAX_CONNECTIONS = 32
 """Requests that are under way at once."""
 MAX_FAILURES = 10
 """Requests in a row, over all worlds, without a usable answer to any, after which the run stops."""
+
+
+type Images = Mapping[str, np.ndarray]
+"""Pictures of all worlds, by camera: uint8, shape [worlds, H, W, 3]."""
 
 
 class RemoteClient[Q, R](Policy):
@@ -135,7 +140,7 @@ class RemoteClient[Q, R](Policy):
         """Request that begins an episode, where the protocol has one."""
         raise TypeError(f"{type(self).__name__} defines no _beginning()")
 
-    def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Q:
+    def _request(self, seen: Observation, state: np.ndarray, images: Images, world: int) -> Q:
         """Request for a world's actions."""
         raise TypeError(f"{type(self).__name__} defines no _request()")
 
@@ -155,7 +160,7 @@ class RemoteClient[Q, R](Policy):
         """
         raise TypeError(f"{type(self).__name__} defines no _rows()")
 
-    def _batch(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]) -> Q:
+    def _batch(self, seen: Observation, state: np.ndarray, images: Images, worlds: Sequence[int]) -> Q:
         """Request for the actions of several worlds, along a leading axis."""
         raise TypeError(f"{type(self).__name__} defines no _batch()")
 
@@ -215,8 +220,9 @@ class RemoteClient[Q, R](Policy):
         if facts.needs_picture is not None:
             self.needs_image = facts.needs_picture
         if facts.picture is not None:
-            fit: Literal["native", "pad"] = "native" if facts.picture.fit == "native" else "pad"
-            self.camera = CameraConfig(width=facts.picture.width, height=facts.picture.height, fit=fit)
+            self.camera = facts.picture.camera
+        if facts.cameras is not None:
+            self.cameras = {name: one.camera for name, one in facts.cameras.items()}
         self.chunk_size = facts.chunk_length or self.chunk_size
         self.realign = facts.realign or 0.0
         self.batched, self._seeded = facts.batched, facts.seeded
@@ -250,8 +256,10 @@ class RemoteClient[Q, R](Policy):
         Raises:
             InputError: The answer is none for this robot.
         """
-        camera = self.camera or CameraConfig()
-        image = np.full((1, camera.height, camera.width, 3), 127, dtype=np.uint8) if self.needs_image else None
+        images = {
+            name: np.full((1, camera.height, camera.width, 3), 127, dtype=np.uint8)
+            for name, camera in policy_cameras(self).items()
+        }
         seen = Observation(
             torch.from_numpy(standing_state()[None]), None, np.ones(1, dtype=bool), "", "", "Stand still."
         )
@@ -262,9 +270,9 @@ class RemoteClient[Q, R](Policy):
             _, errors = self._gather(self.reset_kind, {0: begin}, lambda content: content)
         if not errors:
             if self.batched:
-                request = self._batch(seen, host(seen.state), image, [0])
+                request = self._batch(seen, host(seen.state), images, [0])
             else:
-                request = self._request(seen, host(seen.state), image, 0)
+                request = self._request(seen, host(seen.state), images, 0)
             _, errors = self._gather(self.infer_kind, {0: request}, self._probed)
         self._seeds.clear()
         self._steps.clear()
@@ -301,9 +309,9 @@ class RemoteClient[Q, R](Policy):
         state = host(observation.state)
         asking = [int(w) for w in np.flatnonzero(world_mask(observation.mask, len(state)))]
         errors = {w: self._failed_resets.pop(w) for w in asking if w in self._failed_resets}
-        image = None if observation.image is None else host(observation.image)
+        images = {name: host(image) for name, image in observation.images.items()}
         empty = [w for w in asking if w not in errors and not len(self._queues.get(w, ()))]
-        chunks, failed = self._infer(observation, state, image, empty)
+        chunks, failed = self._infer(observation, state, images, empty)
         errors.update(failed)
         for world, chunk in chunks.items():
             self._queues[world] = chunk
@@ -325,7 +333,7 @@ class RemoteClient[Q, R](Policy):
         return self.checked(chunk[0])
 
     def _infer(
-        self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
+        self, seen: Observation, state: np.ndarray, images: Images, worlds: Sequence[int]
     ) -> tuple[dict[int, np.ndarray], dict[int, str]]:
         """Chunks and errors of the worlds that need a new one."""
         # A server may refuse a batch for one row of it, and JSON has no such numbers.
@@ -335,10 +343,10 @@ class RemoteClient[Q, R](Policy):
         if not worlds:
             return {}, errors
         if not self.batched:
-            requests = {world: self._request(seen, state, image, world) for world in worlds}
+            requests = {world: self._request(seen, state, images, world) for world in worlds}
             got, failed = self._ask(self.infer_kind, requests, self._actions, sequential=self.sequential)
             return got, errors | failed
-        request = self._batch(seen, state, image, worlds)
+        request = self._batch(seen, state, images, worlds)
         got, failed = self._ask(
             self.infer_kind,
             {0: request},
@@ -359,10 +367,10 @@ class RemoteClient[Q, R](Policy):
     def _begin(self, world: int, task: str = "") -> Begin:
         return Begin(session=str(world), seed=self._seeds.get(world), task=task)
 
-    def _query(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> Query:
+    def _query(self, seen: Observation, state: np.ndarray, images: Images, world: int) -> Query:
         return Query(
             state=np.ascontiguousarray(state[world, :STATE_WIDTH], dtype=np.float32),
-            image=None if image is None else np.ascontiguousarray(image[world], dtype=np.uint8),
+            images={name: np.ascontiguousarray(image[world], dtype=np.uint8) for name, image in images.items()},
             task=seen.gym_id,
             instruction=seen.instruction,
             session=str(world),
@@ -382,7 +390,7 @@ class RemoteClient[Q, R](Policy):
             "worlds_matter": self.depends_on_worlds,
         }
         declared = self.declared.to_json() if self.declared != ServedFacts() else {}
-        shown = ("labels", "realign", "chunk_length", "rate_hz", "picture", "batched", "facts")
+        shown = ("labels", "realign", "chunk_length", "rate_hz", "picture", "cameras", "batched", "facts")
         more = {"declared": {name: declared[name] for name in shown if name in declared}, "assumed": self._assumed}
         return facts | {name: value for name, value in more.items() if value}
 

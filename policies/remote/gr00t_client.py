@@ -19,14 +19,15 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from arena_newton.data.readers.label_protocols import V4
+from arena_newton.data.recording.layouts import LAYOUTS
 from arena_newton.errors import InputError
-from arena_newton.pictures.camera import CameraConfig
+from arena_newton.pictures.settings import FRONT, CameraConfig, policy_cameras
 from arena_newton.policies.base import Json, Mask, Observation, world_mask
 from arena_newton.policies.protocols.handshake import ServedFacts, read_facts
 from arena_newton.policies.protocols.packed_arrays import TEXT_KEYS, pack, unpack
 from arena_newton.policies.protocols.raw_arrays import MAX_FRAME, checked_array
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.remote.client import MAX_REPLY, RemoteClient, host
+from arena_newton.policies.remote.client import MAX_REPLY, Images, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink, episode_lost
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, STATE, STATE_WIDTH
 
@@ -102,8 +103,8 @@ def _array(content: Mapping[str, object], where: str) -> np.ndarray | None:
 class ModalityNames:
     """Names of observations and actions on a server."""
 
-    video: str | None = "front"
-    """The head camera; None: it looks at no picture."""
+    video: Mapping[str, str] = field(default_factory=lambda: {FRONT: FRONT})
+    """Name → camera; none: it looks at no picture."""
     state: Mapping[str, slice] = field(default_factory=lambda: {"state": slice(0, STATE_WIDTH)})
     """Name → its numbers of the canonical state."""
     action: Mapping[str, slice] = field(default_factory=lambda: {"action": slice(0, ACTION_WIDTH)})
@@ -118,7 +119,7 @@ class ModalityNames:
     def to_json(self) -> dict[str, object]:
         """The names as JSON."""
         return {
-            "video": self.video,
+            "video": dict(self.video) if {*self.video.values()} - {FRONT} else next(iter(self.video), None),
             "state": list(self.state),
             "action": list(self.action),
             "language": self.language,
@@ -145,8 +146,10 @@ def read_modalities(content: object, where: str) -> ModalityNames:
                 f"{where}: the server wants {name} at ticks {_shown(indices)}, this robot sends that of the present (0)"
             )
     videos = keys["video"][0]
-    if len(videos) > 1:
-        raise InputError(f"{where}: the server wants pictures {_shown(videos)}, this robot sends one, its head camera")
+    known = {name: camera for one in LAYOUTS.values() for camera, name in one.cameras.items()}
+    cameras = {name: known.get(name.removeprefix("video."), FRONT if len(videos) == 1 else "") for name in videos}
+    if "" in cameras.values() or len({*cameras.values()}) < len(videos):
+        raise InputError(f"{where}: the server wants pictures {_shown(videos)}, this robot sends {_shown([*known])}")
     actions, indices = keys["action"]
     found = _slices(actions, {"v3.1": ACTION, "v4": V4}, ACTION_WIDTH, f"{where}: actions")
     states = _slices(keys["state"][0], {"": STATE}, STATE_WIDTH, f"{where}: states")
@@ -156,7 +159,7 @@ def read_modalities(content: object, where: str) -> ModalityNames:
     if indices and indices != tuple(range(len(indices))):
         raise InputError(f"{where}: the server's actions are of ticks {_shown(indices)}, expected 0, 1, 2 ...")
     return ModalityNames(
-        video=videos[0] if videos else None,
+        video=cameras,
         state=states[1],
         action=found[1],
         language=sentences[0] if sentences else None,
@@ -321,7 +324,10 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         self.names = read_modalities(self.without_token(names[0]), where)
         self.take(self._completed(facts))
         self.batched = True
-        self.needs_image = self.names.video is not None
+        self.needs_image, cameras = bool(self.names.video), policy_cameras(self)
+        if {*self.names.video.values()} - {FRONT}:
+            size = self.camera or CameraConfig()
+            self.cameras = {name: cameras.get(name, size) for name in self.names.video.values()}
         self.assume()
         self.probe()
 
@@ -330,7 +336,7 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
         if facts != ServedFacts():
             return facts
         return ServedFacts(
-            labels=self.names.labels, chunk_length=self.names.chunk or None, needs_picture=self.names.video is not None
+            labels=self.names.labels, chunk_length=self.names.chunk or None, needs_picture=bool(self.names.video)
         )
 
     def describe(self) -> Json:
@@ -364,15 +370,17 @@ class Gr00tPolicy(RemoteClient[bytes, bytes]):
     def _beginning(self, world: int, task: str) -> bytes | None:
         return None
 
-    def _batch(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]) -> bytes:
+    def _batch(self, seen: Observation, state: np.ndarray, images: Images, worlds: Sequence[int]) -> bytes:
         rows, numbers = list(worlds), np.ascontiguousarray(state, dtype=np.float32)
         shown: dict[str, object] = {
-            "video": {},
+            "video": {
+                name: np.ascontiguousarray(images[camera][rows, None], dtype=np.uint8)
+                for name, camera in self.names.video.items()
+                if camera in images
+            },
             "state": {name: numbers[rows, None, part] for name, part in self.names.state.items()},
             "language": {},
         }
-        if image is not None and self.names.video is not None:
-            shown["video"] = {self.names.video: np.ascontiguousarray(host(image)[rows, None], dtype=np.uint8)}
         if self.names.language is not None:
             shown["language"] = {self.names.language: [[seen.instruction]] * len(rows)}
         options: dict[str, object] | None = None

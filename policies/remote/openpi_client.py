@@ -18,6 +18,7 @@ from arena_newton.policies.protocols.handshake import ServedFacts
 from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack, unpack
 from arena_newton.policies.protocols.policy_messages import PICTURE_SIDES, Begin
 from arena_newton.policies.protocols.wire_error import WireError
+from arena_newton.policies.remote.client import Images
 from arena_newton.policies.remote.link import RemoteError, episode_lost
 from arena_newton.policies.remote.websocket import (
     SocketClient,
@@ -98,15 +99,16 @@ class OpenpiPolicy(SocketClient):
         """
         facts = self.greet()
         if self.roboarena:
-            self._cameras()
             page = http_page(self, "/config")
             try:
                 facts = arena_codec.unpack_config(page, f"{self.url}/config") if page else facts
             except WireError as error:
                 raise InputError(f"--policy remote: {self.masked(str(error))}") from None
+            if facts == ServedFacts():
+                self._cameras()
         self.take(facts)
         self.extras = facts != ServedFacts()
-        if facts.picture is None:
+        if facts.picture is None and facts.cameras is None:
             self._resolution()
         self.batched = not self.roboarena and self.metadata.get("batched") is True
         self.assume()
@@ -188,16 +190,15 @@ class OpenpiPolicy(SocketClient):
             raise RemoteError(f"{self.url}{self.infer_kind}: no binary frame")
         return openpi_codec.unpack_answer(content, self.url + self.infer_kind)
 
-    def _batch(
-        self, seen: Observation, state: np.ndarray, image: np.ndarray | None, worlds: Sequence[int]
-    ) -> SocketRequest:
+    def _batch(self, seen: Observation, state: np.ndarray, images: Images, worlds: Sequence[int]) -> SocketRequest:
         rows = list(worlds)
         content: dict[str, object] = {
             openpi_codec.STATE_KEY: np.ascontiguousarray(state[rows, :64], dtype=np.float32),
             openpi_codec.PROMPT_KEY: [seen.instruction] * len(rows),
         }
-        if image is not None:
-            content[self.image_key] = np.ascontiguousarray(image[rows], dtype=np.uint8)
+        for name, image in images.items():
+            key = openpi_codec.camera_key(name, self.image_key)
+            content[key] = np.ascontiguousarray(image[rows], dtype=np.uint8)
         if self.extras:
             content["task"] = [seen.gym_id] * len(rows)
             content["seed"] = np.array([self._seeds.get(w, 0) for w in rows], dtype=np.int64)

@@ -14,13 +14,13 @@ import time
 
 import numpy as np
 
-from arena_newton.pictures.camera import CameraConfig
+from arena_newton.pictures.settings import FRONT, CameraConfig
 from arena_newton.policies.base import Json, Observation
 from arena_newton.policies.protocols.handshake import ServedFacts
 from arena_newton.policies.protocols.raw_arrays import checked_array
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.arena_client import RemotePolicy
-from arena_newton.policies.remote.client import MAX_REPLY
+from arena_newton.policies.remote.client import MAX_REPLY, Images
 from arena_newton.policies.remote.link import RemoteError
 from arena_newton.robot.canonical import STATE_WIDTH
 
@@ -86,8 +86,9 @@ class SimplePolicy(RemotePolicy):
         """None: the first query says that an episode begins."""
         return None
 
-    def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> bytes:
-        pictures = {} if image is None else {PICTURE_KEY: pack_array(np.asarray(image[world], np.uint8))}
+    def _request(self, seen: Observation, state: np.ndarray, images: Images, world: int) -> bytes:
+        keys = {name: PICTURE_KEY if name == FRONT else f"rgb_{name}" for name in images}
+        pictures = {keys[name]: pack_array(np.asarray(image[world], np.uint8)) for name, image in images.items()}
         return json.dumps(
             {
                 "image": pictures,

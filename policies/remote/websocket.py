@@ -24,7 +24,7 @@ from arena_newton.policies.protocols.handshake import ServedFacts
 from arena_newton.policies.protocols.policy_messages import Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.remote.address import cause
-from arena_newton.policies.remote.client import MAX_REPLY, RemoteClient
+from arena_newton.policies.remote.client import MAX_REPLY, Images, RemoteClient
 from arena_newton.policies.remote.link import AskAgain, RemoteError, ServerLink
 
 __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "http_page"]
@@ -278,8 +278,8 @@ class SocketClient(RemoteClient[SocketRequest, object]):
         self._checked = True
         return self.greeting
 
-    def _request(self, seen: Observation, state: np.ndarray, image: np.ndarray | None, world: int) -> SocketRequest:
-        query = self._query(seen, state, image, world)
+    def _request(self, seen: Observation, state: np.ndarray, images: Images, world: int) -> SocketRequest:
+        query = self._query(seen, state, images, world)
         return SocketRequest(query, self._begin(world, seen.gym_id), query.step or 0)
 
     def _beginning(self, world: int, task: str) -> SocketRequest | None:

@@ -30,7 +30,7 @@ from arena_newton.data.recording.layouts import state_names
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import plain_text
 from arena_newton.interfaces import Observation
-from arena_newton.pictures.settings import CameraConfig
+from arena_newton.pictures.settings import CAMERAS, FRONT, CameraConfig, policy_cameras
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, ServedPicture
 from arena_newton.policies.protocols.packed_picture import PackedPicture
@@ -182,14 +182,14 @@ class PolicyServer:
         self.counts = ServerCounts()
         self.protocol = protocol(policy.labels or "v3.1")
         self._facts: ServedFacts | None = None
-        self._camera = policy.camera or CameraConfig()
+        self._cameras = policy_cameras(policy)
         state = torch.zeros(max_sessions, STATE_WIDTH)
         state[:, : len(IDENTITY_ROT6D)] = torch.tensor(IDENTITY_ROT6D)
         self._state = state.to(self.device)
-        self._image: torch.Tensor | None = None
-        if policy.needs_image:
-            size = (max_sessions, self._camera.height, self._camera.width, 3)
-            self._image = torch.zeros(size, dtype=torch.uint8, device=self.device)
+        self._images = {
+            name: torch.zeros((max_sessions, one.height, one.width, 3), dtype=torch.uint8, device=self.device)
+            for name, one in self._cameras.items()
+        }
         self._seeds, self._tasks = [0] * max_sessions, [""] * max_sessions
         self._free = list(range(max_sessions))[::-1]
         self._sessions: dict[tuple[str, str], _Session] = {}
@@ -222,6 +222,10 @@ class PolicyServer:
             InputError: The policy cannot work, or only in the process of the world.
         """
         self.policy.check()
+        for name, camera in self._cameras.items():
+            if name not in CAMERAS or camera.depth:
+                kind = f"the depth of {name}" if camera.depth else f"camera {name}"
+                raise InputError(f"--policy {self.policy.name}: observes {kind}, which no protocol carries")
         known = self._known.get(task, _Task(task, task, ""))
         everyone = np.ones(self.max_sessions, dtype=bool)
         self.policy.reset([WARM_UP_SEED] * self.max_sessions, [known.gym_id] * self.max_sessions, everyone)
@@ -229,7 +233,7 @@ class PolicyServer:
         if 0 in chunk.errors:
             raise InputError(f"--policy {self.policy.name}: {chunk.errors[0]}")
         self._check_shape(chunk.actions)
-        labels, picture = self.protocol.name, ServedPicture(self._camera.width, self._camera.height, self._camera.fit)
+        labels, pictures = self.protocol.name, {name: ServedPicture.of(one) for name, one in self._cameras.items()}
         about = json.loads(json.dumps(self.policy.describe(), default=str))
         digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
         self._facts = ServedFacts(
@@ -240,8 +244,9 @@ class PolicyServer:
             state_names=tuple(state_names()),
             chunk_length=int(chunk.actions.shape[1]),
             rate_hz=RATE,
-            needs_picture=self.policy.needs_image,
-            picture=picture if self.policy.needs_image else None,
+            needs_picture=bool(pictures),
+            picture=pictures.get(FRONT),
+            cameras=pictures if {*pictures} - {FRONT} else None,
             seeded=not self.policy.depends_on_worlds,
             facts=about,
         )
@@ -477,8 +482,9 @@ class PolicyServer:
                 if not isinstance(query, Query):
                     raise TypeError("no query")
                 content = zlib.crc32(query.state.tobytes(), zlib.crc32(query.instruction.encode()))
-                if query.image is not None:
-                    content = zlib.crc32(query.image.tobytes(), content)
+                for name in self._cameras:
+                    if isinstance(picture := query.images.get(name), np.ndarray):
+                        content = zlib.crc32(picture.tobytes(), content)
                 session = self._session(job, query, content)
                 if query.step is not None and session.last == (query.step, content) and session.answer is not None:
                     self.counts.repeated += 1
@@ -494,39 +500,40 @@ class PolicyServer:
         self.counts.last_query = time.monotonic()
 
     def _fitted(self, query: Query) -> Query:
-        """A query as the policy sees it: its picture scaled, or none. Large pictures never wait unpacked for others."""
-        if self._image is None:
-            return replace(query, image=None, packed=None)
-        picture = query.image if query.packed is None else query.packed
-        size = (self._camera.height, self._camera.width)
-        if picture is None or isinstance(picture, np.ndarray) and picture.shape[:2] == size:
-            return query
+        """A query as the policy sees it: its pictures scaled. Large pictures never wait unpacked for others."""
+        images = {name: query.images[name] for name in self._cameras if name in query.images}
+        for name, picture in images.items():
+            camera = self._cameras[name]
+            if isinstance(picture, np.ndarray) and picture.shape[:2] == (camera.height, camera.width):
+                continue
 
-        def fit() -> np.ndarray:
-            pixels = picture.unpacked() if isinstance(picture, PackedPicture) else picture
-            return fitted_picture(pixels, self._camera)
+            def fit(picture: np.ndarray | PackedPicture = picture, camera: CameraConfig = camera) -> np.ndarray:
+                pixels = picture.unpacked() if isinstance(picture, PackedPicture) else picture
+                return fitted_picture(pixels, camera)
 
-        try:
-            return replace(query, image=self._in_turn(picture.nbytes, fit), packed=None)
-        except Exception as error:
-            raise self._refusal(error) from None
+            try:
+                images[name] = self._in_turn(picture.nbytes, fit)
+            except Exception as error:
+                raise self._refusal(error) from None
+        return replace(query, images=images)
 
     def _see(self, row: int, query: Query) -> None:
         """Put what a session sees into its row."""
         if query.robot_type and query.robot_type != self.protocol.robot_type:
             kinds = f"{plain_text(query.robot_type, 60)!r}, the policy's actions are for {self.protocol.robot_type!r}"
             raise Refused("unfit", f"robot_type is {kinds} (label protocol {self.protocol.name})")
-        if self._image is not None:
-            if query.image is None:
-                raise Refused("unfit", f"policy {self.policy.name} needs a picture, the message holds none")
-            self._image[row] = torch.from_numpy(np.ascontiguousarray(query.image)).to(self.device)
+        for name, images in self._images.items():
+            if name not in query.images:
+                of = "" if name == FRONT else f" of {name}"
+                raise Refused("unfit", f"policy {self.policy.name} needs a picture{of}, the message holds none")
+            images[row] = torch.from_numpy(np.ascontiguousarray(query.images[name])).to(self.device)
         self._state[row] = torch.from_numpy(query.state).to(self.device)
 
     def _observation(self, task: _Task, rows: Sequence[int]) -> Observation:
         mask = np.zeros(self.max_sessions, dtype=bool)
         mask[list(rows)] = True
         described = task.name, task.gym_id, task.instruction, self.tracker
-        return Observation(self._state, self._image, mask, *described)
+        return Observation(self._state, self._images.get(FRONT), mask, *described, images=self._images)
 
     def _act(self, task: _Task, asking: Sequence[tuple[_Job, _Session]]) -> None:
         """One call of the policy."""

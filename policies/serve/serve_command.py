@@ -173,8 +173,10 @@ def _greeting(server: PolicyServer, options: ServeOptions, guard: ConnectionGuar
     scheme = kind + ("s" if options.tls_cert else "")
     address = ServerAddress(options.protocol, scheme, options.host, port, "").place
     picture = "no picture"
-    if facts.picture is not None:
-        picture = f"pictures of {facts.picture.width}x{facts.picture.height} ({facts.picture.fit})"
+    shown = facts.cameras or ({} if facts.picture is None else {"": facts.picture})
+    if shown:
+        sizes = [f"{f'{name} ' if name else ''}{one.width}x{one.height} ({one.fit})" for name, one in shown.items()]
+        picture = f"pictures of {', '.join(sizes)}"
     lines = [
         f"policy {facts.policy}: chunks of {facts.chunk_length} actions of {facts.labels} at {facts.rate_hz:g} Hz, "
         f"{picture}",

@@ -51,19 +51,20 @@ SMALLER = {
 """Parameters of networks that are smaller than their family's largest, with new weights; counted."""
 
 
-def network_bytes(recipe: TrainingRecipe, device: torch.device) -> int:
+def network_bytes(recipe: TrainingRecipe, device: torch.device, cameras: int = 1) -> int:
     """Memory that a training must find beside its pictures [bytes].
 
     Args:
         recipe: Family and batch size count; the networks of `small` are too small to.
         device: On a host 0: its memory is not divided into a network's and pictures' here.
+        cameras: Pictures of a sample, each of which is encoded.
     """
     if device.type != "cuda":
         return 0
     if recipe.name == "small":
         return CONTEXT_BYTES
     size = SIZES[recipe.family]
-    return CONTEXT_BYTES + size.parameters * size.parameter_bytes + recipe.batch_size * size.sample_bytes
+    return CONTEXT_BYTES + size.parameters * size.parameter_bytes + recipe.batch_size * size.sample_bytes * cameras
 
 
 def checkpoint_bytes(recipe: TrainingRecipe, *, pretrained: bool) -> int:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton.cli.flags import Several, flag_name
 from arena_newton.errors import InputError
+from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ __all__ = [
 
 UNCOMPILED = ("pi05",)
 """Families that --compile refuses."""
+ROBOT_CAMERAS = tuple(name for name in CAMERAS if name != "world")
+"""Cameras that policies are trained on: those that the robot carries."""
 BALANCES = ("picture", "task")
 """Draws of the samples."""
 
@@ -60,6 +63,8 @@ class PolicyTrainOptions:
     resume: Path | None = None
     """Folder of a training to go on with, with its own options; only --device, --steps, --minutes (in all),
     --save-every and the like may differ."""
+    cameras: Several[str] = (FRONT,)
+    """Cameras that the policy looks through: front left_wrist right_wrist, of those that the datasets have."""
     labels: str = ""
     """Protocol of the network's actions, v3.1 or v4; the recipe's by default. A dataset of the other one is converted
     in memory."""
@@ -245,6 +250,12 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     if options.labels not in ("", "v3.1", "v4"):
         raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
     look_fractions(options.looks)
+    named = {*options.cameras}
+    if not named or len(named) < len(options.cameras) or named - {*ROBOT_CAMERAS}:
+        expected = f"expected different ones of {' '.join(ROBOT_CAMERAS)}"
+        raise InputError(f"--cameras {' '.join(options.cameras)}: {expected}")
+    if options.looks and named != {FRONT}:
+        raise InputError("--looks: changes the pictures of camera front alone, but --cameras names others")
     if options.balance not in BALANCES:
         raise InputError(f"--balance {options.balance}: unknown, choose from {', '.join(BALANCES)}")
     if task_weights(options.task_weights) and options.balance != "task":

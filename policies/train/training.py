@@ -98,7 +98,7 @@ def _train(
     if options.compile:
         check_compiler(device)
     families.check_weights(settings, options.weights or None)
-    datasets = [read_rows(root, settings.labels) for root in options.dataset]
+    datasets = [read_rows(root, settings.labels, options.cameras) for root in options.dataset]
     if options.episodes:
         datasets = [dataset.first(options.episodes) for dataset in datasets]
     if progress is not None:
@@ -106,10 +106,11 @@ def _train(
     check_pictures(datasets, settings)
     began = time.monotonic()
     every = options.picture_every
-    total = sum(-(-episode.length // every) for dataset in datasets for episode in dataset.episodes)
+    cameras = len(options.cameras)
+    total = cameras * sum(-(-episode.length // every) for dataset in datasets for episode in dataset.episodes)
     with tqdm(total=total, unit="picture", desc="decoding", disable=None if speaks else True, leave=False) as bar:
         jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
-        network = network_bytes(settings, device)
+        network = network_bytes(settings, device, cameras)
         store = load_frames(
             datasets,
             device,

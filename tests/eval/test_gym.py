@@ -16,6 +16,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.adapters import gym
 from arena_newton.eval.adapters.gym import ArenaVectorEnv
 from arena_newton.eval.plan import episode_plan
+from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies import get
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.rules import seeding
@@ -59,6 +60,10 @@ def make():
         env.close()
 
 
+WRIST = CameraConfig(40, 36, "left_wrist")
+"""A camera of another size than the others of its batch."""
+
+
 def stand(env):
     """The standing action for every world."""
     return np.tile(STAND_ACTION, (env.num_envs, 1))
@@ -85,10 +90,11 @@ def test_every_task_has_an_id():
 
 def test_what_it_returns_is_in_its_spaces(make, brief):
     """Observations of reset, steps and ended episodes are elements of the spaces; flags and rewards are arrays."""
-    env = make(image_size=(48, 32), cameras={"front": "ego", "outside": "world"})
+    env = make(image_size=(48, 32), cameras={"front": "ego", "outside": "world", "wrist": WRIST})
     observation, info = env.reset(seed=3)
     assert env.observation_space.contains(observation) and info["seed"].tolist() == [3, 4]
-    assert observation["pixels"]["front"].shape == (2, 32, 48, 3) and observation["agent_pos"].dtype == np.float32
+    assert observation["pixels"]["front"].shape == (2, 32, 48, 3) and observation["pixels"]["wrist"].std() > 0
+    assert observation["pixels"]["wrist"].shape == (2, 36, 40, 3) and observation["agent_pos"].dtype == np.float32
     assert observation["task"] == (tasks.get("boxing").instruction,) * 2
     seen = observation["pixels"]["front"].copy()
     for tick in range(200):
@@ -385,6 +391,7 @@ def shared_env():
         ({"seed_range": "exam"}, "seed_range exam"),
         ({"max_episode_steps": 0}, "max_episode_steps 0"),
         ({"cameras": {"front": "nose"}, "image_size": (32, 32)}, "nose"),
+        ({"cameras": {"front": CameraConfig(depth=True)}, "image_size": (32, 32)}, "front: depth"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

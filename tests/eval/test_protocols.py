@@ -28,6 +28,7 @@ from arena_newton.eval.adapters.protocol_comparison import (
 )
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.play.run import Factories
+from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.replay import ReplayEpisodes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
@@ -167,10 +168,11 @@ def test_the_checkpoint_says_how_it_is_played(checkpoint, monkeypatch, tmp_path)
     argv(monkeypatch, checkpoint)
     said = ArenaNewtonEnv(task="boxing").policy_worlds
     assert (said.labels, said.realign, said.query_ticks, said.task_vector) == ("v4", 0.05, 6, TASKS)
-    assert (said.width, said.height, said.fit) == (SIDE, SIDE, "native")
+    assert said.cameras == {"front": CameraConfig(width=SIDE, height=SIDE, fit="native")}
     own = ArenaNewtonEnv(task="boxing", fit="pad", realign=0.0, image_width=96, labels="v3.1", task_vector="boxing")
-    assert own.policy_worlds.fit == "pad" and own.policy_worlds.realign == 0.0 and own.policy_worlds.labels == "v3.1"
-    assert own.features["observation.images.front"].shape == (SIDE, 96, 3) and own.policy_worlds.height == SIDE
+    assert own.policy_worlds.realign == 0.0 and own.policy_worlds.labels == "v3.1"
+    assert own.policy_worlds.cameras == {"front": CameraConfig(width=96, height=SIDE)}
+    assert own.features["observation.images.front"].shape == (SIDE, 96, 3)
     assert own.features["observation.environment_state"].shape == (1,)
     argv(monkeypatch, checkpoint, "--policy.n_action_steps=3")
     assert ArenaNewtonEnv(task="boxing").policy_worlds.query_ticks == 3
@@ -180,11 +182,13 @@ def test_the_checkpoint_says_how_it_is_played(checkpoint, monkeypatch, tmp_path)
         ArenaNewtonEnv(task="football")
     argv(monkeypatch, tmp_path)  # none of ours
     other = ArenaNewtonEnv(task="football").policy_worlds
-    assert (other.labels, other.fit, other.width, other.task_vector) == ("v3.1", "pad", 224, ())
+    assert (other.labels, other.cameras, other.task_vector) == ("v3.1", {"front": CameraConfig()}, ())
     features = {"observation.images.front": {"type": "VISUAL", "shape": [3, 480, 640]}}
+    features["observation.images.right_wrist"] = {"type": "VISUAL", "shape": [3, 96, 96]}
     (tmp_path / "config.json").write_text(json.dumps({"n_action_steps": 8, "input_features": features}))
     trained = ArenaNewtonEnv(task="football").policy_worlds  # by lerobot-train, on pictures of the sensor's own shape
-    assert (trained.width, trained.height, trained.fit, trained.labels) == (640, 480, "native", "v3.1")
+    front, wrist = CameraConfig(width=640, height=480, fit="native"), CameraConfig(96, 96, "right_wrist")
+    assert trained.cameras == {"front": front, "right_wrist": wrist} and trained.labels == "v3.1"
     with pytest.raises(InputError, match="--env.fit wide"):
         ArenaNewtonEnv(task="boxing", fit="wide")
 

@@ -248,22 +248,37 @@ def test_only_successes_are_kept_in_rounds(brief, tmp_path, parts, capsys):
     assert json.loads((folder / "results.json").read_text())["complete"] is True
 
 
-def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, parts, monkeypatch):
-    """If the policy asks for the recorded picture, recording renders none besides, and the video is the same."""
-    renders = []
+@pytest.mark.parametrize("names", [("front",), ("left_wrist", "front", "right_wrist")])
+def test_a_picture_for_a_policy_is_rendered_once(brief, tmp_path, parts, monkeypatch, names):
+    """If the policy asks for the recorded pictures, recording renders none besides, and the videos are the same."""
+    renders, seen = [], []
     render = Camera.render
     monkeypatch.setattr(Camera, "render", lambda self, *a: renders.append(1) or render(self, *a))
 
     def seeing(spec, **options):
         policy = policies.get(spec, **options)
-        policy.needs_image, policy.camera = True, CameraConfig(width=64, height=64)
+        if len(names) == 1:
+            policy.needs_image, policy.camera = True, CameraConfig(width=64, height=64)
+        else:
+            policy.cameras = dict.fromkeys(names, CameraConfig(width=64, height=64))
+            policy.cameras["world"] = CameraConfig(width=40, height=32, depth=True)
+        act = policy.act
+        policy.act = lambda observation: seen.append(observation) or act(observation)
         return policy
 
-    command = ["record", *BRIEF, "--episodes", "1", "--out", str(tmp_path / "seen")]
-    assert main(command, Factories(env=parts.env, policy=seeing)) == 0
+    command = ["record", *BRIEF, "--episodes", "1", "--cameras", *names]
+    assert main([*command, "--out", str(tmp_path / "seen")], Factories(env=parts.env, policy=seeing)) == 0
     (record,) = load_run(tmp_path / "seen").records
-    assert len(renders) <= record.steps + 1
-    assert (tmp_path / "seen" / record.media["front"]).read_bytes() == (brief / record.media["front"]).read_bytes()
+    assert len(renders) <= (record.steps + 1) * len(seen[0].images)
+    other = brief
+    if len(names) > 1:
+        other = tmp_path / "unseen"
+        assert main([*command, "--out", str(other)], parts) == 0
+        assert [*seen[0].images] == [*names, "world"] and seen[0].image is seen[0].images["front"]
+        assert [*seen[0].depths] == ["world"] and seen[0].depths["world"].shape == (1, 32, 40)
+        assert 0.5 < float(seen[0].depths["world"].max()) < 50.0
+    films = [[(folder / record.media[name]).read_bytes() for name in names] for folder in (tmp_path / "seen", other)]
+    assert films[0] == films[1] and len(set(films[0])) == len(names)
 
 
 @pytest.mark.parametrize("name", ["episodes", "episodes/videos"])

@@ -15,12 +15,13 @@ from arena_newton.errors import InputError  # noqa: E402
 from arena_newton.eval.__main__ import main  # noqa: E402
 from arena_newton.eval.studies import action_map  # noqa: E402
 from arena_newton.eval.studies.action_map import embed, separation, shifted  # noqa: E402
-from arena_newton.eval.studies.predicted_actions import FRONT, DatasetObservations, as_many_of_each, predict  # noqa: E402
+from arena_newton.eval.studies.predicted_actions import DatasetObservations, as_many_of_each, predict  # noqa: E402
 from arena_newton.pictures.settings import CameraConfig  # noqa: E402
 from arena_newton.policies.base import POLICIES  # noqa: E402
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION  # noqa: E402
 from tests.policies.original_dataset import features, write_dataset  # noqa: E402
 
+FRONT = "observation.images.front"
 LENGTHS = (31, 24, 40, 28)
 SIZE = 64
 

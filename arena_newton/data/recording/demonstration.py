@@ -165,8 +165,8 @@ class DemonstrationRecorder(Recorder):
         self.facts = json.dumps(dict(facts or {}), sort_keys=True)
         self._env: World | None = None
         self._views: dict[str, Camera] = {}
-        self._shared: str | None = None
-        """Camera whose pictures the policy sees too."""
+        self._shared: set[str] = set()
+        """Cameras whose pictures the policy sees too."""
         self._streams: dict[int, _Stream] = {}
         self._acting: list[int] = []
         self._videos: dict[str, list[VideoStream]] = {}
@@ -191,10 +191,9 @@ class DemonstrationRecorder(Recorder):
         self._discard()
         self._env = env
         self._described = env.describe()
-        front = self.cameras.get("front")
+        same = {name for name, config in self.cameras.items() if env.camera_configs.get(name) == config}
         # Surfaces of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
-        same = env.camera is not None and front == env.camera_config and not self.depth and not self.looks
-        self._shared = "front" if same else None
+        self._shared = set() if self.depth or self.looks else same
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
         pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
         if self.looks:
@@ -229,17 +228,7 @@ class DemonstrationRecorder(Recorder):
         self._object_rows = torch.tensor(list(self._bodies.values()), dtype=torch.long, device=env.torch_device)
 
     def _view(self, env: World, name: str, config: CameraConfig) -> Camera:
-        if name == self._shared and env.camera is not None:
-            return env.camera
-        return Camera.from_scene(
-            env.scene,
-            prim=config.prim,
-            width=config.width,
-            height=config.height,
-            fit=config.fit,
-            samples=config.samples,
-            lights=env.lights,
-        )
+        return env.cameras[name] if name in self._shared else Camera.of_config(env.scene, config, env.lights)
 
     def start(self, env: World, world: int, episode: RecordedEpisode) -> None:
         """An episode without rows yet."""
@@ -301,7 +290,7 @@ class DemonstrationRecorder(Recorder):
     def _film(self, env: World, name: str, camera: Camera, mask: np.ndarray, observation: Observation) -> None:
         """Render a camera and hand the pictures to whoever makes the films."""
         missing = mask
-        if name == self._shared and observation.image is not None:  # what the policy saw is rendered once
+        if name in self._shared and name in observation.images:  # what the policy saw is rendered once
             missing = mask & ~observation.mask
         if missing.any():
             env.render(camera, missing)

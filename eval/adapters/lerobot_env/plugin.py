@@ -15,20 +15,18 @@ from arena_newton import tasks as task_registry
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
-from arena_newton.pictures.settings import Fit
+from arena_newton.pictures.settings import CAMERAS, CameraConfig, Fit
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
-__all__ = ["CAMERAS", "ArenaNewtonEnv", "DropRepeated"]
+__all__ = ["ArenaNewtonEnv", "DropRepeated"]
 
 LABELS = ("v3.1", "v4")
 """Label protocols, `data.readers.label_protocols.LABELS`."""
 FPS = 50
 """Ticks per second."""
-CAMERAS = {"front": "ego", "left_wrist": "left_wrist", "right_wrist": "right_wrist", "world": "world"}
-"""Name in datasets (the original's) → camera of the scene."""
 REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")
 """Names that LeRobot gives to observations that have a dataset's name already."""
 FITS = ("pad", "native")
@@ -74,8 +72,8 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     """USD layer instead of the one task's own scene."""
     fast_physics: bool = False
     """Use the tracker's fast physics rate."""
-    cameras: str = "front"
-    """Observed cameras, with commas between: front, left_wrist, right_wrist, world."""
+    cameras: str | None = None
+    """Observed cameras, with commas between: front, left_wrist, right_wrist, world; the policy's, or front."""
     image_width: int | None = None
     """Width of pictures [px]; the policy's, or 224."""
     image_height: int | None = None
@@ -119,14 +117,12 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             query_ticks=declared.query_ticks if self.query_ticks is None else self.query_ticks,
             task_vector=declared.task_vector if self.task_vector is None else _names(self.task_vector),
             tracker_vector=declared.tracker_vector if self.tracker_vector is None else _names(self.tracker_vector),
-            width=declared.width if self.image_width is None else self.image_width,
-            height=declared.height if self.image_height is None else self.image_height,
-            fit=declared.fit if self.fit is None else self.fit,
+            cameras=self._pictures(declared),
         )
         if worlds.labels not in LABELS:
             raise InputError(f"--env.labels {worlds.labels}: unknown, choose from {', '.join(LABELS)}")
-        if worlds.fit not in FITS:
-            raise InputError(f"--env.fit {worlds.fit}: unknown, choose from {', '.join(FITS)}")
+        if self.fit not in (None, *FITS):
+            raise InputError(f"--env.fit {self.fit}: unknown, choose from {', '.join(FITS)}")
         if not 0.0 <= worlds.realign <= 1.0:
             raise InputError(f"--env.realign {worlds.realign}: expected 0 to 1")
         if worlds.query_ticks < 1:
@@ -135,11 +131,13 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             task_registry.get(task)
             if worlds.task_vector and task not in worlds.task_vector:
                 raise InputError(f"--env.task {task}: the policy was trained on {', '.join(worlds.task_vector)}")
-        shape = (worlds.height, worlds.width, 3)
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_WIDTH,)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, (STATE_WIDTH,)),
-            **{f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in self.prims},
+            **{
+                f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, (one.height, one.width, 3))
+                for name, one in worlds.cameras.items()
+            },
         }
         if worlds.task_vector:
             width = len(worlds.task_vector) + (len(worlds.tracker_vector) + 1 if worlds.tracker_vector else 0)
@@ -154,14 +152,18 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             raise InputError("--env.task: nothing named, at least one task is needed")
         return task_registry.names() if names == ("all",) else names
 
-    @property
-    def prims(self) -> dict[str, str]:
-        """Name in datasets → camera of the scene."""
-        names = _names(self.cameras)
+    def _pictures(self, declared: PolicyWorlds) -> dict[str, CameraConfig]:
+        """Cameras by their names in datasets: the policy's, with what the flags change."""
+        names = tuple(declared.cameras) if self.cameras is None else _names(self.cameras)
+        usual = next(iter(declared.cameras.values()))
+        found = {}
         for name in names:
             if name not in CAMERAS:
                 raise InputError(f"--env.cameras {name}: unknown, choose from {', '.join(CAMERAS)}")
-        return {name: CAMERAS[name] for name in names}
+            one = declared.cameras.get(name, usual)
+            size = self.image_width or one.width, self.image_height or one.height
+            found[name] = CameraConfig(*size, CAMERAS[name], self.fit or one.fit)
+        return found
 
     @property
     def gym_kwargs(self) -> dict[str, object]:
@@ -179,9 +181,7 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
             "device": self.device,
             "variant_file": self.variant_file,
             "fast_physics": self.fast_physics,
-            "image_size": (self.policy_worlds.width, self.policy_worlds.height),
-            "fit": self.policy_worlds.fit,
-            "cameras": self.prims,
+            "cameras": self.policy_worlds.cameras,
             "state_keys": ("agent_pos", OBS_STATE),
             "instruction": False,
             "startup": "reset",

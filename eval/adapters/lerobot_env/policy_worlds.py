@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot.configs import parser
@@ -12,7 +12,7 @@ from lerobot.utils.constants import OBS_IMAGES
 from arena_newton.errors import InputError
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.stored_json import read_object
-from arena_newton.pictures.settings import Fit, robot_fit
+from arena_newton.pictures.settings import CAMERAS, FRONT, CameraConfig, recorded_camera
 
 __all__ = ["PolicyWorlds", "policy_worlds"]
 
@@ -31,19 +31,18 @@ class PolicyWorlds:
     """Tasks in the order of the one-hot vector that the policy is given; none: it is given no such vector."""
     tracker_vector: tuple[str, ...] = ()
     """Trackers in the order of the numbers that follow, as of `CheckpointFacts`."""
-    width: int = 224
-    """Width of its pictures [px]."""
-    height: int = 224
-    """Height of its pictures [px]."""
-    fit: Fit = "pad"
-    """Fit of the camera's 4:3 picture into that size, as in `CameraConfig`."""
+    cameras: Mapping[str, CameraConfig] = field(default_factory=lambda: {FRONT: CameraConfig()})
+    """Its pictures, by camera."""
     source: Path | None = None
     """File that says so; None: these are the defaults of what says nothing."""
 
     @property
     def sentence(self) -> str:
         """The values, as flags of the environment."""
-        flags = {"labels": self.labels, "image_width": self.width, "image_height": self.height, "fit": self.fit}
+        first = next(iter(self.cameras.values()))
+        flags = {"labels": self.labels, "image_width": first.width, "image_height": first.height, "fit": first.fit}
+        if [*self.cameras] != [FRONT]:
+            flags["cameras"] = ",".join(self.cameras)
         if self.labels == "v4":
             flags |= {"realign": self.realign, "query_ticks": self.query_ticks}
         for name in ("task_vector", "tracker_vector"):
@@ -71,34 +70,38 @@ def policy_worlds() -> PolicyWorlds:
     path = Path(given) / CONFIG_FILE
     content = read_object(path, MAX_CONFIG_BYTES)
     facts, ticks = CheckpointFacts.read(path.parent), _query_ticks(path, content)
+    fit = None if facts is None else facts.camera.fit
+    cameras = {name: recorded_camera(name, *size, fit) for name, size in _pictures(path, content).items()}
     if facts is None:
-        width, height = _picture(path, content)
-        fit = robot_fit(width, height)  # as eval record takes them
-        return PolicyWorlds(query_ticks=ticks, width=width, height=height, fit=fit, source=path)
-    camera = facts.camera
+        return PolicyWorlds(query_ticks=ticks, cameras=cameras or PolicyWorlds().cameras, source=path)
     return PolicyWorlds(
         labels=facts.labels,
         realign=facts.realign,
         query_ticks=ticks,
         task_vector=facts.task_vector,
         tracker_vector=facts.tracker_vector,
-        width=camera.width,
-        height=camera.height,
-        fit=camera.fit,
+        cameras=cameras or {FRONT: facts.camera},
         source=path.with_name(FACTS_FILE),
     )
 
 
-def _picture(path: Path, content: Mapping[str, object]) -> tuple[int, int]:
-    """Width and height of the head camera's pictures [px]; 224 for a policy that names none."""
+def _pictures(path: Path, content: Mapping[str, object]) -> dict[str, tuple[int, int]]:
+    """Width and height of the pictures of each camera that a policy names [px]."""
     inputs = content.get("input_features")
-    front = inputs.get(f"{OBS_IMAGES}.front") if isinstance(inputs, dict) else None
-    if front is None:
-        return PolicyWorlds.width, PolicyWorlds.height
-    shape = front.get("shape") if isinstance(front, dict) else None
-    if not isinstance(shape, list) or len(shape) != 3 or not all(isinstance(n, int) and 1 <= n <= 4096 for n in shape):
-        raise InputError(f"{path}: input {OBS_IMAGES}.front has shape {shape!r:.40}, expected [3, height, width]")
-    return shape[2], shape[1]
+    found = {}
+    for name in CAMERAS:
+        feature = inputs.get(f"{OBS_IMAGES}.{name}") if isinstance(inputs, dict) else None
+        if feature is None:
+            continue
+        shape = feature.get("shape") if isinstance(feature, dict) else None
+        if (
+            not isinstance(shape, list)
+            or len(shape) != 3
+            or not all(isinstance(n, int) and 1 <= n <= 4096 for n in shape)
+        ):
+            raise InputError(f"{path}: input {OBS_IMAGES}.{name} has shape {shape!r:.40}, expected [3, height, width]")
+        found[name] = shape[2], shape[1]
+    return found
 
 
 def _query_ticks(path: Path, content: Mapping[str, object]) -> int:

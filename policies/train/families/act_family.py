@@ -12,7 +12,6 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import (
     ACTION,
-    FRONT,
     Losses,
     TrainableModel,
     new_policy,
@@ -79,7 +78,7 @@ def build(recipe: TrainingRecipe, stats: Stats, device: torch.device, weights: s
     config, usable = prepared(recipe, stats, device)
     policy = new_policy(config)
     wanted = weights if weights is not None else recipe.network.get("pretrained_backbone_weights")
-    if wanted is not None and FRONT in config.input_features:
+    if wanted is not None and config.image_features:
         load_resnet(policy.model.backbone, str(config.vision_backbone), wanted)
     if recipe.batch_norm:
         with_batch_norm(policy.model.backbone)

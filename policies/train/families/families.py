@@ -1,9 +1,9 @@
 """Policies of LeRobot as a trainer needs them: from a recipe, with a loss for CUDA graphs, saved for a stock LeRobot.
 
-A batch is a dict of normalised tensors on the device: `observation.images.front` [B, 3, H, W], `observation.state`
-[B, 64], for recipes with a task vector `observation.environment_state` [B, tasks], `action` [B, n, 40] at the offsets
-`samples` of the model from the observation's tick, `action_is_pad` bool [B, n]; for families that read the instruction
-either `task`, a list of strings, or its tokens (`tokens` of the model).
+A batch is a dict of normalised tensors on the device: `observation.images.front` [B, 3, H, W] and so on of each camera
+that the statistics name, `observation.state` [B, 64], for recipes with a task vector `observation.environment_state`
+[B, tasks], `action` [B, n, 40] at the offsets `samples` of the model from the observation's tick, `action_is_pad` bool
+[B, n]; for families that read the instruction either `task`, a list of strings, or its tokens (`tokens` of the model).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from arena_newton.policies.train.frames.feature_scaling import Scaling, Stats, s
 
 __all__ = [
     "ACTION",
-    "FRONT",
+    "IMAGES",
     "PAD",
     "STATE",
     "TASK_VECTOR",
@@ -43,8 +43,8 @@ __all__ = [
 type Losses = tuple[torch.Tensor, torch.Tensor]
 """Loss of a batch, a scalar, and each sample's part of it without a gradient, shape [B], whose mean it is."""
 
-FRONT = "observation.images.front"
-"""Key of the head camera's picture, float32 [B, 3, H, W]."""
+IMAGES = "observation.images."
+"""Beginning of the key of a camera's picture, float32 [B, 3, H, W], before the camera's name."""
 STATE = "observation.state"
 """Key of the canonical state."""
 TASK_VECTOR = "observation.environment_state"
@@ -79,10 +79,9 @@ def configuration(recipe: TrainingRecipe, stats: Stats, device: torch.device) ->
         network["dtype"] = recipe.precision
     network = {name: tuple(value) if isinstance(value, list) else value for name, value in network.items()}
     network["normalization_mapping"] = {kind: NormalizationMode(mode) for kind, mode in modes.items()}
-    inputs = {
-        FRONT: PolicyFeature(FeatureType.VISUAL, (3, recipe.height, recipe.picture)),
-        STATE: PolicyFeature(FeatureType.STATE, tuple(stats[STATE]["mean"].shape)),
-    }
+    picture = PolicyFeature(FeatureType.VISUAL, (3, recipe.height, recipe.picture))
+    inputs = {name: picture for name in stats if name.startswith(IMAGES)}
+    inputs[STATE] = PolicyFeature(FeatureType.STATE, tuple(stats[STATE]["mean"].shape))
     if recipe.use_task_vector:
         if "mean" not in stats.get(TASK_VECTOR, {}):
             raise InputError(f"statistics of {TASK_VECTOR}: missing, which a recipe with a task vector needs")

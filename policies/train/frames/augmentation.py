@@ -19,6 +19,7 @@ def gathered_pictures(
     store: FrameStore,
     rows: torch.Tensor,
     *,
+    camera: int = 0,
     tall: int = 0,
     changed: torch.Tensor | None = None,
     shift: int = 0,
@@ -33,6 +34,7 @@ def gathered_pictures(
     Args:
         store: All pictures.
         rows: Rows of the samples, int64, shape [B].
+        camera: Number of the camera.
         tall: Height of the pictures that are wanted, cut about the middle of the camera's [px]; 0: its own.
         changed: Samples whose looks are changed, bool, shape [B], each at a row that has looks; None: none of them.
         shift: Most pixels by which a picture is shifted in each direction.
@@ -45,7 +47,7 @@ def gathered_pictures(
     batch, device, tall = len(rows), store.device, tall or store.height
     stored, above = store.middle(tall)
     height, width = int(stored.shape[1]), int(stored.shape[2])
-    numbers = store.picture[rows]
+    numbers = store.picture[rows] + camera * (len(store.pictures) // len(store.cameras))
     if shift:
         moved = torch.randint(-shift, shift + 1, (2, batch, 1), device=device)
         down = (torch.arange(height, device=device) + moved[0]).clamp_(0, height - 1)

@@ -10,7 +10,7 @@ import torch
 
 from arena_newton.policies.lerobot.checkpoint_facts import vector_of
 from arena_newton.policies.train.frames.augmentation import gathered_pictures
-from arena_newton.policies.train.frames.demonstration_rows import ACTION_KEY, CAMERA_KEY, STATE_KEY, VECTOR_KEY
+from arena_newton.policies.train.frames.demonstration_rows import ACTION_KEY, PICTURES, STATE_KEY, VECTOR_KEY
 from arena_newton.policies.train.frames.frame_store import FrameStore
 
 __all__ = ["BalancedOrder", "BatchMaker", "RowOrder", "step_seed"]
@@ -160,8 +160,8 @@ class BatchMaker:
             unknown: Fraction of the samples whose tracker the vector does not name.
 
         Returns:
-            `observation.images.front` [B, 3, H, W], `observation.state` [B, 64], `action` [B, n, 40], `action_is_pad`
-            bool [B, n]; the task vector and tokens of language where the policy takes them.
+            `observation.images.front` [B, 3, H, W], and so on of each camera, `observation.state` [B, 64], `action` [B,
+            n, 40], `action_is_pad` bool [B, n]; the task vector and tokens of language where the policy takes them.
         """
         store, changed = self.store, None
         if looks and store.looks is not None:
@@ -169,9 +169,19 @@ class BatchMaker:
         wanted = rows[:, None] + self._offsets
         inside = torch.minimum(torch.maximum(wanted, store.first[rows][:, None]), store.last[rows][:, None])
         batch = {
-            CAMERA_KEY: gathered_pictures(
-                store, rows, changed=changed, tall=self.tall, shift=shift, colour=colour, transforms=transforms
-            ),
+            PICTURES + name: gathered_pictures(
+                store,
+                rows,
+                camera=number,
+                changed=changed,
+                tall=self.tall,
+                shift=shift,
+                colour=colour,
+                transforms=transforms,
+            )
+            for number, name in enumerate(store.cameras)
+        }
+        batch |= {
             STATE_KEY: store.states[rows],
             ACTION_KEY: store.actions[inside],
         }

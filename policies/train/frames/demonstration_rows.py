@@ -17,11 +17,13 @@ from arena_newton.data.readers.label_protocols import LABELS, action_names, enco
 from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.data.readers.looks import LOOKS_FOLDER
 from arena_newton.errors import InputError
+from arena_newton.pictures.settings import FRONT
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 __all__ = [
     "ACTION_KEY",
     "CAMERA_KEY",
+    "PICTURES",
     "STATE_KEY",
     "VECTOR_KEY",
     "DatasetRows",
@@ -32,7 +34,9 @@ __all__ = [
 
 STATE_KEY, ACTION_KEY = "observation.state", "action"
 """LeRobot's names of state and action."""
-CAMERA_KEY = "observation.images.front"
+PICTURES = "observation.images."
+"""Beginning of the names of pictures, before that of the camera."""
+CAMERA_KEY = f"{PICTURES}{FRONT}"
 """Name of the head camera's pictures."""
 VECTOR_KEY = "observation.environment_state"
 """Name of the one-hot vector of task and tracker: LeRobot's networks take it as a token of its own."""
@@ -67,14 +71,14 @@ class DatasetRows:
     root: Path
     episodes: tuple[EpisodeRows, ...]
     trackers: tuple[str, ...]
-    camera: str
-    """Feature of the head camera."""
+    cameras: Mapping[str, str]
+    """Camera → its feature, of those that are trained on."""
     height: int
     """Height of a picture [px]."""
     width: int
     """Width of a picture [px]."""
-    picture_statistics: Mapping[str, np.ndarray]
-    """Per channel on the scale 0 to 1, shape [3, 1, 1], and `count`."""
+    picture_statistics: Mapping[str, Mapping[str, np.ndarray]]
+    """Of each camera per channel on the scale 0 to 1, shape [3, 1, 1], and `count`."""
     hash: str
     """`content_hash`."""
 
@@ -104,15 +108,16 @@ class DatasetRows:
         }
 
 
-def read_rows(root: Path, labels: str) -> DatasetRows:
+def read_rows(root: Path, labels: str, cameras: Sequence[str] = (FRONT,)) -> DatasetRows:
     """Read the rows of a dataset.
 
     Args:
         root: Its folder.
         labels: Protocol in which the actions are wanted, `v3.1` or `v4`.
+        cameras: Cameras whose pictures are wanted, by their names in recordings.
 
     Raises:
-        InputError: It is no dataset of canonical states and actions with the head camera's pictures, or is damaged.
+        InputError: It is no dataset of canonical states and actions with those pictures, in one size, or is damaged.
     """
     if not (root / "meta" / "info.json").is_file():
         raise InputError(
@@ -127,10 +132,18 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
     keys = files.video_keys
     if not keys:
         raise InputError(f"{where}: features: has no pictures, which a policy is to see")
-    camera = CAMERA_KEY if CAMERA_KEY in keys else keys[0]
-    shape = shape_of(files, camera)
-    if len(shape) != 3 or shape[2] != 3 or not all(16 <= n <= 4096 for n in shape[:2]):
-        raise InputError(f"{where}: features: {camera} has shape {shape}, expected [height, width, 3]")
+    features = {name: PICTURES + name for name in cameras}
+    if FRONT in features and CAMERA_KEY not in keys:
+        features[FRONT] = keys[0]
+    shape: list[int] = []
+    for name, key in features.items():
+        if key not in keys:
+            raise InputError(f"--cameras {name}: {where} has no {key}, but {', '.join(keys)}")
+        shape, before = shape_of(files, key), shape
+        if len(shape) != 3 or shape[2] != 3 or not all(16 <= n <= 4096 for n in shape[:2]):
+            raise InputError(f"{where}: features: {key} has shape {shape}, expected [height, width, 3]")
+        if before and shape != before:
+            raise InputError(f"{where}: features: {key} has shape {shape}, other cameras {before}, expected one size")
     seeds = about.seeds()
     states, actions = episode_arrays(files, about.labels)
     episodes = []
@@ -144,10 +157,10 @@ def read_rows(root: Path, labels: str) -> DatasetRows:
         root=files.root,
         episodes=tuple(episodes),
         trackers=tuple(sorted({seed.tracker for seed in seeds})),
-        camera=camera,
+        cameras=features,
         height=shape[0],
         width=shape[1],
-        picture_statistics=picture_statistics(files, camera),
+        picture_statistics={name: picture_statistics(files, key) for name, key in features.items()},
         hash=content_hash(files, states, actions),
     )
 
@@ -252,12 +265,14 @@ def statistics(
     names = action_names(labels)
     states = aggregated([row_statistics(episode.states) for episode in episodes])
     actions = aggregated([row_statistics(episode.actions, names) for episode in episodes])
-    shown = [dict(dataset.picture_statistics) for dataset in datasets]
-    common = set.intersection(*(set(one) for one in shown))
-    pictures = aggregated([{name: one[name] for name in common} for one in shown])
+    found = {}
+    for camera in datasets[0].cameras:
+        shown = [dict(dataset.picture_statistics[camera]) for dataset in datasets]
+        common = set.intersection(*(set(one) for one in shown))
+        found[PICTURES + camera] = aggregated([{name: one[name] for name in common} for one in shown])
     states["std"] = np.maximum(states["std"], state_floor)
     actions["std"] = np.maximum(actions["std"], action_floor)
-    found = {CAMERA_KEY: pictures, STATE_KEY: states, ACTION_KEY: actions}
+    found |= {STATE_KEY: states, ACTION_KEY: actions}
     return {
         key: {name: values.astype(np.float32) for name, values in of.items() if name in STATISTICS}
         for key, of in found.items()

@@ -76,7 +76,8 @@ def usable_stats(recipe: TrainingRecipe, stats: Stats) -> dict[str, dict[str, to
         found[feature] = values
     colours = {"mean": torch.tensor(IMAGENET_MEAN), "std": torch.tensor(IMAGENET_STD)}
     colours |= {"min": torch.zeros(3), "max": torch.ones(3)}
-    found["observation.images.front"] = {name: value.reshape(3, 1, 1) for name, value in colours.items()}
+    for camera in [one for one in stats if one.startswith(_PICTURES)] or [f"{_PICTURES}front"]:
+        found[camera] = {name: value.reshape(3, 1, 1) for name, value in colours.items()}
     return found
 
 

@@ -7,6 +7,7 @@ picture, are cut off, and put back when a batch is made for a network that sees 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import torch
 
 from arena_newton.data.readers.frame_reader import Frames
 from arena_newton.errors import InputError
+from arena_newton.pictures.settings import FRONT
 from arena_newton.policies.train.frames.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
 from arena_newton.policies.train.frames.demonstration_rows import (
     ACTION_KEY,
@@ -56,9 +58,10 @@ class FrameStore:
     """Rows of all episodes, one after the other, on one device."""
 
     pictures: torch.Tensor
-    """uint8, shape [pictures, height - top - bottom, width, 3]."""
+    """uint8, shape [cameras * pictures, height - top - bottom, width, 3]: all of one camera, then those of the next."""
     picture: torch.Tensor
-    """Number of each row's picture, of a row without one that of the last before it, int64, shape [rows]."""
+    """Number of each row's picture by the first camera, of a row without one that of the last before it, int64, shape
+    [rows]."""
     states: torch.Tensor
     """float32, shape [rows, 64]."""
     actions: torch.Tensor
@@ -90,6 +93,8 @@ class FrameStore:
     """Rows from one picture of an episode to the next; the first row has one."""
     looks: LookStore | None = None
     """Looks of the pictures, where a training changes them."""
+    cameras: tuple[str, ...] = (FRONT,)
+    """Names of the cameras."""
 
     @property
     def device(self) -> torch.device:
@@ -222,6 +227,7 @@ def load_frames(
             raise InputError(
                 f"--hold-out {hold_out}: {dataset.root} has {len(dataset.episodes)} episodes, none would be left"
             )
+    cameras = tuple(datasets[0].cameras)
     rows = sum(dataset.frames for dataset in datasets)
     films = episode_films(datasets, every)
     count = sum(film.frames for film in films)
@@ -244,15 +250,15 @@ def load_frames(
             (top, bottom), on_frames = black, lambda count: None
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]
-    return assembled(episodes, pictures, held, top, bottom, every)
+    return assembled(episodes, pictures, held, top, bottom, every, cameras)
 
 
 def episode_films(datasets: Sequence[DatasetRows], every: int = 1) -> list[EpisodeFilm]:
-    """Video files and time ranges of all episodes' pictures, and where they are wanted."""
+    """Video files and time ranges of all episodes' pictures, camera by camera, and where they are wanted."""
     found: list[EpisodeFilm] = []
     row = 0
-    for dataset in datasets:
-        parts = Frames(dataset.root, dataset.camera).parts[: len(dataset.episodes)]
+    for camera, dataset in itertools.product(datasets[0].cameras, datasets):
+        parts = Frames(dataset.root, dataset.cameras[camera]).parts[: len(dataset.episodes)]
         for number, (episode, part) in enumerate(zip(dataset.episodes, parts, strict=True)):
             count = -(-episode.length // every)
             found.append(EpisodeFilm(dataset.root, number, part.path, part.first, count, row, every))
@@ -306,6 +312,7 @@ def assembled(
     top: int,
     bottom: int,
     every: int = 1,
+    cameras: tuple[str, ...] = (FRONT,),
 ) -> FrameStore:
     """Rows of episodes next to their pictures."""
     device = pictures.device
@@ -338,6 +345,7 @@ def assembled(
         top=top,
         bottom=bottom,
         every=every,
+        cameras=cameras,
     )
 
 

@@ -98,21 +98,22 @@ def configuration(family, features, clip=None, **changes):
     )
 
 
-def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.02, **changes):
+def save(folder, family, *, clip=None, facts=None, side=(SIDE, SIDE), spread=0.02, cameras=("front",), **changes):
     """A checkpoint that sways about standing; `facts` None: somebody else's."""
     torch.manual_seed(7)
     features = {
         STATE: PolicyFeature(FeatureType.STATE, (64,)),
-        FRONT: PolicyFeature(FeatureType.VISUAL, (3, *side)),
     }
+    features |= {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *side)) for name in cameras}
     stand = torch.from_numpy(STAND_ACTION)
     if facts is not None and facts.labels == "v4":
         stand = torch.from_numpy(encode_v4(STAND_ACTION[None])[0])
     stats = {
         STATE: {"mean": torch.zeros(64), "std": torch.ones(64)},
-        FRONT: {"mean": torch.full((3, 1, 1), 0.5), "std": torch.full((3, 1, 1), 0.25)},
         "action": {"mean": stand, "std": torch.full((40,), spread)},
     }
+    colours = {"mean": torch.full((3, 1, 1), 0.5), "std": torch.full((3, 1, 1), 0.25)}
+    stats |= {f"observation.images.{name}": colours for name in cameras}
     if facts is not None and facts.task_vector:
         features[TASK] = PolicyFeature(FeatureType.ENV, (facts.vector_width,))
         stats[TASK] = {"mean": torch.zeros(facts.vector_width), "std": torch.ones(facts.vector_width)}
@@ -134,16 +135,18 @@ def facts(**changes):
     return CheckpointFacts(**{"width": SIDE, "height": SIDE} | changes)
 
 
-def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="twist2"):
+def seen(seeds, ticks, mask=None, *, side=(SIDE, SIDE), task="boxing", tracker="twist2", cameras=("front",)):
     """Observation of worlds, which follows from each world's seed and tick alone."""
-    state, pictures = [], []
+    state, pictures = [], {name: [] for name in cameras}
     for key in zip(seeds, ticks, strict=True):
         rng = np.random.default_rng(key)
         state.append(0.3 * rng.standard_normal(64).astype(np.float32))
-        pictures.append(rng.integers(0, 256, (*side, 3), np.uint8))
+        for name in cameras:
+            pictures[name].append(rng.integers(0, 256, (*side, 3), np.uint8))
     return Observation(
         state=torch.from_numpy(np.stack(state)),
-        image=torch.from_numpy(np.stack(pictures)),
+        image=None,
+        images={name: torch.from_numpy(np.stack(shown)) for name, shown in pictures.items()},
         mask=np.ones(len(seeds), bool) if mask is None else np.asarray(mask, bool),
         task=task,
         gym_id=task,

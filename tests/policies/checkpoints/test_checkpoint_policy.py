@@ -62,19 +62,26 @@ def test_noise_is_an_episodes_own(made, family):
     assert all(torch.equal(a, b) for a, b in zip((first, second), answers(1), strict=True))
 
 
-def test_an_answer_is_what_lerobot_computes(made, checkpoints):
-    """ACT: the same numbers as LeRobot's own loading, processors and network, of which the first are executed."""
+@pytest.mark.parametrize("cameras", [("front",), ("right_wrist", "front", "left_wrist")])
+def test_an_answer_is_what_lerobot_computes(made, checkpoints, tmp_path, cameras):
+    """ACT of one camera and of three: the numbers of LeRobot's own loading, processors and network, the first ones."""
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
 
-    network = ACTPolicy.from_pretrained(checkpoints["act"])
-    before, after = make_pre_post_processors(network.config, pretrained_path=checkpoints["act"])
-    shown = seen([11], [0])
-    batch = {STATE: shown.state, FRONT: shown.image.permute(0, 3, 1, 2).contiguous().float() / 255.0}
+    folder, policy = checkpoints["act"], made["act"]
+    if len(cameras) > 1:
+        folder = save(tmp_path, "act", facts=facts(family="act"), cameras=cameras)
+        policy = LeRobotPolicy(folder)
+    network = ACTPolicy.from_pretrained(folder)
+    before, after = make_pre_post_processors(network.config, pretrained_path=folder)
+    shown = seen([11], [0], cameras=cameras)
+    batch = {STATE: shown.state}
+    for name, image in shown.images.items():
+        batch[f"observation.images.{name}"] = image.permute(0, 3, 1, 2).contiguous().float() / 255.0
     chunk = network.predict_action_chunk(before(batch))
     wanted = torch.stack([after(chunk[:, tick]) for tick in range(CHUNK)], dim=1)
-    made["act"].reset([11], ["boxing"])
-    assert torch.equal(made["act"].act(shown).actions, wanted)
+    policy.reset([11], ["boxing"])
+    assert torch.equal(policy.act(shown).actions, wanted)
 
 
 @pytest.mark.parametrize("family", ["diffusion", "flow"])

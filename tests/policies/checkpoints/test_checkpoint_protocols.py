@@ -26,9 +26,11 @@ TICKS = 13
 
 @pytest.fixture(scope="module")
 def fast(tmp_path_factory):
-    """A random ACT of v4 that turns this way and that, realigned strongly so that it matters in a second."""
+    """A random ACT of v4 that looks through three cameras and turns, realigned so that it matters in a second."""
     about = facts(labels="v4", realign=0.05, family="act")
-    return save(tmp_path_factory.mktemp("fast"), "act", facts=about, spread=0.1)
+    return save(
+        tmp_path_factory.mktemp("fast"), "act", facts=about, spread=0.1, cameras=("front", "left_wrist", "right_wrist")
+    )
 
 
 def test_a_v4_checkpoint_through_lerobot_eval(fast, tmp_path, monkeypatch):
@@ -36,7 +38,7 @@ def test_a_v4_checkpoint_through_lerobot_eval(fast, tmp_path, monkeypatch):
     monkeypatch.setattr(gym, "ArenaEnv", WatchedEnv)
     policy = LeRobotPolicy(fast)
     env = WatchedEnv(
-        "boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", camera=policy.camera
+        "boxing", tracker=trackers.get("twist2"), worlds=2, engine="mujoco", device="cpu", cameras=policy.cameras
     )
     episodes = episode_plan.expand(["boxing"], trackers=["twist2"], policy="test", seeds=[0], repeats=2)
     ours = {}

@@ -26,6 +26,7 @@ from arena_newton.policies import Chunk, Observation, Policy, world_mask
 from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.handshake import ServedFacts, ServedPicture
 from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack
+from arena_newton.policies.protocols.packed_picture import PackedPicture
 from arena_newton.policies.protocols.policy_messages import Begin, End
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 
@@ -254,8 +255,9 @@ class SocketServer(Recorder):
             if isinstance(request, End):
                 self.note("end", request)
                 continue
-            if request.packed is not None:
-                request = dataclasses.replace(request, image=request.packed.unpacked(), packed=None)
+            shown = request.images.items()
+            unpacked = {name: one.unpacked() if isinstance(one, PackedPicture) else one for name, one in shown}
+            request = dataclasses.replace(request, images=unpacked)
             self.note("query", request)
             kind = self.fault(request)
             if kind == "text":

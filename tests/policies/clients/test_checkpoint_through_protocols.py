@@ -1,4 +1,7 @@
-"""One checkpoint, a random ACT of v4 whose heading is realigned, through each protocol: the same episodes as alone."""
+"""One checkpoint through each protocol: the same episodes as alone.
+
+A random ACT of v4 whose heading is realigned, and which looks through the cameras of head and wrists.
+"""
 
 import sys
 from pathlib import Path
@@ -28,13 +31,14 @@ REALIGN = 0.05
 TICKS = 8
 """Ticks of an episode, more than two chunks."""
 SEEDS = (3, 5, 8)
+CAMERAS = ("left_wrist", "front", "right_wrist")
 
 
 @pytest.fixture(scope="module")
 def checkpoint(narrow_resnet, tmp_path_factory):
     """A tiny ACT that turns this way and that."""
     about = made_checkpoints.facts(labels="v4", realign=REALIGN, family="act")
-    return made_checkpoints.save(tmp_path_factory.mktemp("act"), "act", facts=about, spread=0.1)
+    return made_checkpoints.save(tmp_path_factory.mktemp("act"), "act", facts=about, spread=0.1, cameras=CAMERAS)
 
 
 class Gr00tCheckpoint(Gr00tServer):
@@ -48,10 +52,12 @@ class Gr00tCheckpoint(Gr00tServer):
             labels="v4",
             action_names=tuple(action_names("v4")),
             chunk_length=policy.chunk_size,
-            picture=ServedPicture(policy.camera.width, policy.camera.height, policy.camera.fit),
+            cameras={name: ServedPicture.of(camera) for name, camera in policy.cameras.items()},
             realign=REALIGN,
         )
-        super().__init__(MODALITIES | {"action": {"modality_keys": names, "delta_indices": ticks}}, declared=about)
+        video = {"modality_keys": ["ego_view", "left_wrist", "right_wrist"], "delta_indices": [0]}
+        action = {"modality_keys": names, "delta_indices": ticks}
+        super().__init__(MODALITIES | {"video": video, "action": action}, declared=about)
 
     def actions(self, data):
         seen, options = data["observation"], data["options"]
@@ -60,12 +66,13 @@ class Gr00tCheckpoint(Gr00tServer):
         self.policy.reset(options["seed"], tasks)
         queries = Observation(
             torch.from_numpy(state.copy()),
-            torch.from_numpy(seen["video"]["ego_view"][:, 0].copy()),
+            torch.from_numpy(seen["video"].pop("ego_view")[:, 0].copy()),
             np.ones(len(state), bool),
             "boxing",
             options["task"],
             "Strike.",
         )
+        queries.images |= {name: torch.from_numpy(one[:, 0].copy()) for name, one in seen["video"].items()}
         chunk = np.asarray(self.policy.act(queries).actions, np.float32)
         return [{name: chunk[..., part] for name, part in V4.items()}, {}]
 
@@ -102,7 +109,7 @@ def test_one_checkpoint_through_every_protocol(checkpoint):
             raw = "raw" in name or name == "gr00t"
             assert (policy.labels, policy.realign) == (("v4", REALIGN) if raw else ("v3.1", 0.0))
         env = env or ArenaEnv(
-            "boxing", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", camera=policy.camera
+            "boxing", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", cameras=policy.cameras
         )
         played = []
         reader = read_by(policy, policy.labels)

@@ -257,7 +257,10 @@ def modalities(**other):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"video": {"modality_keys": ["top", "wrist"]}}, "wants pictures top, wrist, this robot sends one"),
+        (
+            {"video": {"modality_keys": ["top", "wrist"]}},
+            "wants pictures top, wrist, this robot sends front, left_wrist, right_wrist, world, ego_view, head_camera",
+        ),
         ({"video": {"delta_indices": [-1, 0]}}, "wants video at ticks -1, 0"),
         ({"state": {"modality_keys": ["single_arm", "gripper"]}}, "states are single_arm, gripper, expected one name"),
         ({"action": {"modality_keys": ["single_arm", "gripper"]}}, "actions are single_arm, gripper, expected one"),
@@ -276,7 +279,11 @@ def test_modalities_that_this_robot_does_not_have(change, text):
 def test_modalities():
     """Names of slices split state and action, one name is all of it, and those of v4 say so."""
     names = read_modalities(modalities(), "server")
-    assert names.video == "ego_view" and names.chunk == CHUNK and names.labels == "v3.1"
+    assert names.video == {"ego_view": "front"} and names.chunk == CHUNK and names.labels == "v3.1"
+    assert names.to_json()["video"] == "ego_view"
+    several = {"modality_keys": ["video.right_wrist", "video.ego_view"], "delta_indices": [0]}
+    seen = read_modalities(modalities(video=several), "server").video
+    assert seen == {"video.right_wrist": "right_wrist", "video.ego_view": "front"}
     assert {name: (part.start, part.stop) for name, part in names.state.items()} == {
         "root_rot6d": (0, 6),
         "joint_pos": (6, 35),

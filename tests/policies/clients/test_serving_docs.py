@@ -49,7 +49,7 @@ def test_declarations():
     """The table has every key of a declaration that is compared or followed."""
     said = set(re.findall(r"`(\w+)`", " ".join(row[0] for row in rows("declared"))))
     known = set(ServedFacts(**{name: () for name in ("action_names", "state_names")}).to_json())
-    known |= {"labels", "realign", "picture", "needs_picture", "chunk_length", "rate_hz"}
+    known |= {"labels", "realign", "picture", "needs_picture", "cameras", "chunk_length", "rate_hz"}
     known |= {"action_names", "state_names"}
     assert said == known - {"arena", "batched"} and expected_facts().rate_hz == RATE
 

@@ -101,7 +101,11 @@ def state(first=0.0, kind=0):
 
 def query(first=0.0, *, kind=0, image=None, **more):
     """A look at such a state."""
-    return Query(state(first, kind), image, **({"task": "boxing", "instruction": "Box."} | more))
+    return Query(
+        state(first, kind),
+        {} if image is None else {"front": image},
+        **({"task": "boxing", "instruction": "Box."} | more),
+    )
 
 
 class Served:

@@ -5,6 +5,7 @@ source, not with the codecs and not with installed servers of those projects.
 """
 
 import base64
+import dataclasses
 import io
 import json
 import struct
@@ -144,20 +145,21 @@ def test_golden_arena():
 
 
 def test_records_come_back():
-    """Every record is the same after each codec, pictures to the bit (PNG is lossless)."""
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    seen = query(0.3, image=image, session="3", seed=2**31 - 1, step=40)
+    """Every record is the same after each codec, pictures of all cameras to the bit (PNG is lossless)."""
+    rng = np.random.default_rng(0)
+    images = {name: rng.integers(0, 255, (24, 32, 3), np.uint8) for name in ("front", "left_wrist", "world")}
+    seen = dataclasses.replace(query(0.3, session="3", seed=2**31 - 1, step=40), images=images)
 
     def same(got):
-        assert np.array_equal(got.image if got.packed is None else got.packed.unpacked(), image) and np.array_equal(
-            got.state, seen.state
-        )
+        assert np.array_equal(got.state, seen.state) and [*got.images] == [*images]
+        for name, image in got.images.items():
+            assert np.array_equal(image if isinstance(image, np.ndarray) else image.unpacked(), images[name])
         named = ("task", "instruction", "session", "seed", "step")
         assert [getattr(got, name) for name in named] == [getattr(seen, name) for name in named]
 
     same(openpi_codec.unpack_request(openpi_codec.pack_request(seen, roboarena=True))[0])
-    for images in ("png", "raw"):
-        frame = vla_eval_codec.pack_request(seen, 1, 0.0, images)
+    for form in ("png", "raw"):
+        frame = vla_eval_codec.pack_request(seen, 1, 0.0, form)
         same(vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame)))
     same(arena_codec.unpack_query(arena_codec.pack_query(seen))[0])
     begin = Begin("3", 5, "boxing", "Box.")
@@ -285,7 +287,7 @@ def test_a_gray_picture_becomes_rgb():
     payload = {"images": {"cam": content}, "states": [1.0] * STATE_WIDTH}
     frame = msgpack.packb({"type": "observation", "payload": payload, "seq": 1, "timestamp": 0.0})
     seen = vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame))
-    assert seen.packed.unpacked().shape == (24, 32, 3) and (seen.packed.unpacked() == 7).all()
+    assert seen.image.unpacked().shape == (24, 32, 3) and (seen.image.unpacked() == 7).all()
 
 
 def test_a_float32_picture_of_the_original_s_protocol():
@@ -360,7 +362,8 @@ def test_a_traceback_is_one_line():
 def test_handshake_comes_back():
     """Declared facts are the same behind every protocol, also where they are few."""
     few = ServedFacts(picture=ServedPicture(64, 48, "native"), chunk_length=20, realign=0.002, facts={"family": "act"})
-    for facts in (expected_facts("v4"), ServedFacts(), few):
+    eyes = {"left_wrist": ServedPicture(64, 48, "native"), "world": ServedPicture(32, 32)}
+    for facts in (expected_facts("v4"), ServedFacts(), few, ServedFacts(needs_picture=True, cameras=eyes)):
         assert openpi_codec.unpack_metadata(openpi_codec.pack_metadata(facts), "s")[0] == facts
         hello = vla_eval_codec.unpack_message(vla_eval_codec.pack_hello(facts, 1, 0.0))
         assert vla_eval_codec.unpack_hello(hello, "s") == (facts, True)
@@ -385,6 +388,8 @@ def test_handshake_comes_back():
         ({"arena": 1, "chunk_length": -1}, "declares: chunk_length is"),
         ({"arena": 1, "rate_hz": 0}, "declares: rate_hz is"),
         ({"arena": 1, "picture": {"width": 224}}, "declares: picture is"),
+        ({"arena": 1, "cameras": {"front": {"width": 224}}}, "declares: cameras is"),
+        ({"arena": 1, "cameras": {"rear": {"width": 64, "height": 64}}}, "declares: cameras is"),
         ({"arena": 1, "realign": 2}, "declares: realign is"),
         ({"arena": 1, "batched": 1}, "declares: batched is"),
     ],

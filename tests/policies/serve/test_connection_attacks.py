@@ -176,10 +176,10 @@ def asked_with(**images):
 
 
 def test_pictures_stay_packed():
-    """Of the pictures of a message only that of the head camera is ever unpacked, and none before its turn."""
+    """Of the pictures of a message only those of our cameras are ever unpacked, and none before its turn."""
     frame = asked_with(wrist=picture(*LARGEST), front=picture(32, 24))
     seen = vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame))
-    assert seen.image is None and seen.packed.unpacked().shape == (24, 32, 3)
+    assert [*seen.images] == ["front"] and seen.image.unpacked().shape == (24, 32, 3)
     with pytest.raises(WireError, match="^message: a picture of 1920x1201, expected 16 to 2048 pixels a side and at m"):
         vla_eval_codec.unpack_message(asked_with(front=picture(1920, 1201)))
 

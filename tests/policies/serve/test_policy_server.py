@@ -275,10 +275,25 @@ def test_pictures_are_fitted(made):
     with pytest.raises(WireError, match="64x48 cannot be made 32x32"):
         fitted_picture(native, CameraConfig(width=32, height=32, fit="native"))
     server = made(Remembers(sees=True))
-    answer = server.query("a", Query(state(), native, "boxing", seed=1, step=0)).actions
+    answer = server.query("a", Query(state(), {"front": native}, "boxing", seed=1, step=0)).actions
     assert answer[0, 12] == pytest.approx(0.001 * padded.mean(), rel=1e-4)
     with pytest.raises(Refused, match="needs a picture, the message holds none"):
         server.query("a", query(step=4))
+
+
+@pytest.mark.parametrize(
+    ("name", "camera", "said"),
+    [
+        ("rear", CameraConfig(prim="/World/Rear"), "camera rear"),
+        ("front", CameraConfig(depth=True), "the depth of front"),
+    ],
+)
+def test_a_camera_that_no_robot_sends_is_refused(name, camera, said):
+    """A policy whose cameras or depths no protocol carries is not served."""
+    policy = Remembers()
+    policy.cameras = {name: camera}
+    with pytest.raises(InputError, match=f"remembers: observes {said}, which no protocol carries"):
+        PolicyServer(policy).start()
 
 
 def test_a_closed_server_refuses(made):

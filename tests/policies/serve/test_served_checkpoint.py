@@ -77,7 +77,7 @@ def test_robots_are_served_as_if_alone(served, checkpoints, family, options):
         chunks, step = [], 0
         for number in range(queries):
             state, image = shown(seed, number)
-            query = Query(state, image, "boxing", SENTENCE, seed=seed, step=step)
+            query = Query(state, {"front": image}, "boxing", SENTENCE, seed=seed, step=step)
             chunks.append(one.server.query(str(seed), query).actions)
             step += len(chunks[-1])
         one.server.leave(str(seed))
@@ -98,5 +98,5 @@ def test_raw_labels_are_the_networks(served, checkpoints):
     one = served(make_policy(options, torch.device("cpu")), max_sessions=2)
     assert one.server.facts.labels == "v4" and one.server.facts.realign == 0.002
     state, image = shown(3, 0)
-    chunk = one.server.query("a", Query(state, image, "boxing", SENTENCE, seed=3, step=0)).actions
+    chunk = one.server.query("a", Query(state, {"front": image}, "boxing", SENTENCE, seed=3, step=0)).actions
     assert np.array_equal(chunk, alone(LeRobotPolicy(checkpoints["act"]), 3, 1)[0])

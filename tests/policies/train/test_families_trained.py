@@ -8,11 +8,20 @@ from pathlib import Path
 import pytest
 import torch
 
+from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.lerobot.encoder_sources import checkpoint_encoders
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.training import train
-from tests.policies.train.stock_lerobot import opened
+from tests.policies.train.small_dataset import make_dataset
+from tests.policies.train.stock_lerobot import opened, raw_observation
+
+
+@pytest.fixture(scope="module")
+def seeing(tmp_path_factory):
+    """A dataset with the pictures of the cameras of head and wrists."""
+    return make_dataset(tmp_path_factory.mktemp("seeing"), cameras=("front", "left_wrist", "right_wrist"))
 
 
 @pytest.mark.parametrize("family", ["diffusion", "flow", "pi05"])
@@ -37,3 +46,27 @@ def test_a_family_is_trained_and_opens(family, dataset, tmp_path, narrow_resnet)
     seen = before({"observation.state": torch.zeros(1, 64), "task": ["Open the door."]})
     assert ("observation.language.tokens" in seen) == (family != "diffusion")
     assert after(torch.zeros(1, 40)).shape == (1, 40)
+
+
+@pytest.mark.parametrize("family", ["act", "diffusion", "flow"])
+def test_a_policy_of_several_cameras(family, seeing, tmp_path, narrow_resnet):
+    """Each picture decides what it answers, in a stock LeRobot too; resumed, it looks through the same cameras."""
+    eyes = ("front", "left_wrist", "right_wrist")
+    given = {"policy": family, "recipe": "small", "dataset": (seeing,), "device": "cpu", "quiet": True}
+    train(PolicyTrainOptions(**given, out=tmp_path / "run", cameras=eyes, steps=1))
+    folder = train(PolicyTrainOptions(resume=tmp_path / "run", steps=2, device="cpu", quiet=True))
+    made = LeRobotPolicy(folder)
+    wanted = {name: CameraConfig(64, 64, "ego" if name == "front" else name) for name in eyes}
+    assert made.cameras == wanted and made.checkpoint.facts.fit == "pad"
+    policy, before, _ = opened(folder)
+    observation = raw_observation(rows=1) | {f"observation.images.{name}": torch.rand(1, 3, 64, 64) for name in eyes}
+    assert [*policy.config.image_features] == [f"observation.images.{name}" for name in eyes]
+
+    def answer(seen):
+        torch.manual_seed(1)
+        policy.reset()
+        return policy.select_action(before(seen))
+
+    whole = answer(observation)
+    for name in eyes:
+        assert not torch.equal(answer(observation | {f"observation.images.{name}": torch.rand(1, 3, 64, 64)}), whole)

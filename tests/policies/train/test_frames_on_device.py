@@ -62,6 +62,26 @@ def test_pictures_are_the_datasets(dataset, store):
         assert np.array_equal((found[row] * 255).round().byte().permute(1, 2, 0).numpy(), wanted), row
 
 
+def test_pictures_of_several_cameras(tmp_path):
+    """A batch holds each camera's own pictures of its rows, over several datasets, as if the camera were alone."""
+    data = make_dataset(tmp_path, cameras=("front", "left_wrist", "right_wrist"))
+    names = ("right_wrist", "front")
+
+    def loaded(cameras):
+        whole = read_rows(data, "v4", cameras)
+        return load_frames([whole.first(2), whole], CPU, jobs=2)
+
+    store, shown = loaded(names), {}
+    batch = BatchMaker(store, unchanged, range(3))(torch.arange(store.rows))
+    for name in names:
+        alone = loaded((name,))
+        shown[name] = gathered_pictures(alone, torch.arange(alone.rows))
+        assert torch.equal(batch[f"observation.images.{name}"], shown[name])
+    assert not torch.equal(*shown.values()) and "observation.images.left_wrist" not in batch
+    with pytest.raises(InputError, match=r"--cameras world: .*info.json has no observation.images.world, but"):
+        loaded(("front", "world"))
+
+
 def test_the_first_episodes_alone(rows, store):
     """Two of three episodes before another dataset: its rows follow theirs, and every picture stays with its state."""
     few = load_frames([rows.first(2), rows], CPU, jobs=2)
