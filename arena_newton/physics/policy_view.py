@@ -21,7 +21,9 @@ from arena_newton.interfaces import World
 
 __all__ = ["PolicyView"]
 
-OF_WORLD = "spec mode rules worlds device torch_device engine startup_ticks tick active budget camera_config".split()
+OF_WORLD = (
+    "spec mode modes rules worlds device torch_device engine startup_ticks tick active budget camera_config".split()
+)
 """Attributes of a `World` that a policy may read, besides `scene`, `physics`, the tracker's name and those that a class
 of worlds names in `shown`."""
 OF_SCENE = """path hands worlds device stage mj_model body_ids joint_ids geom_labels drive latch robot body_id has_body
