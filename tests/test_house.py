@@ -186,6 +186,8 @@ def test_the_page_of_rooms_names_each():
         listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
         groups = [[p for p in part.split() if f"{folder}.{p}" in packages] for part in INNER[folder].split("|")]
         assert listed == [name for group in groups for name in sorted(group, key=[*listed, *group].index)], folder
+    unhashed = page.split("Not hashed there: ")[1].split(";")[0]
+    assert re.findall(r"`([\w/]+)`", unhashed) == [room for room in UNHASHED if not room.startswith("eval/")]
     for file, name in re.findall(r"\]\(../../(\S+)\): `(\w+)`", page):
         assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
 

@@ -96,6 +96,9 @@ class TrainingRecipe:
     batch_norm: bool = False
     """ACT's vision encoder is normalised by its batches. LeRobot's has the statistics of its pretrained weights, and
     without such weights none."""
+    frozen_norms: float = 0.0
+    """Last fraction of the steps in which the vision encoder is normalised by the statistics that it has when it plays,
+    those of the pictures before; of `batch_norm` alone."""
     use_task_vector: bool = False
     """The one-hot vector of the task is an input, `observation.environment_state`."""
     state_std_floor: float = 1e-3
@@ -119,7 +122,7 @@ class TrainingRecipe:
         for name in ("lr_backbone", "weight_decay", "warmup_steps", "decay_steps", "shift_px"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{at}: {name} is {getattr(self, name)}, expected 0 or more")
-        for name in ("realign", "final_lr_fraction", "colour"):
+        for name in ("realign", "final_lr_fraction", "colour", "frozen_norms"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"{at}: {name} is {getattr(self, name)}, expected 0 to 1")
         choices = {"schedule": _SCHEDULES, "precision": _PRECISIONS, "optimizer": ("adam", "adamw")}
@@ -337,6 +340,7 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
     ("*", "compact"): _FAST,
     ("act", "compact"): {
         "batch_norm": True,
+        "cut_pad": True,
         "use_task_vector": True,
         "network": {
             "pretrained_backbone_weights": None,

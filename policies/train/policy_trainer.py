@@ -104,7 +104,9 @@ class PolicyTrainer:
         self._used: list[torch.Tensor] = []
         """Parameters on which the loss depends, whose gradients are in `_flat`."""
         self._graphs: list[torch.cuda.CUDAGraph] = []
-        model.policy.train()
+        self._frozen = False
+        """True if the vision encoder's normalisation keeps its statistics."""
+        self._training_mode()
         if ranks > 1:
             for tensor in model.policy.state_dict().values():
                 torch.distributed.broadcast(tensor, 0)
@@ -144,6 +146,10 @@ class PolicyTrainer:
             self._advance()
 
     def _advance(self) -> None:
+        if self._norms_frozen != self._frozen:
+            self._frozen = self._norms_frozen
+            self._graphs.clear()
+            self._training_mode()
         if self.graphed and not self._graphs:
             self._capture()
         self._prepare(self.step)
@@ -158,6 +164,26 @@ class PolicyTrainer:
                 self._average()
             self._update()
         self.step += 1
+
+    @property
+    def _norms_frozen(self) -> bool:
+        """True in the last steps, of which the recipe gives the fraction."""
+        return self.step >= self.recipe.steps * (1.0 - self.recipe.frozen_norms)
+
+    def _training_mode(self) -> None:
+        self.model.policy.train()
+        for module in self.model.policy.modules() if self._frozen else ():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                module.eval()
+
+    @contextlib.contextmanager
+    def _evaluating(self) -> Iterator[None]:
+        """The policy in evaluation mode."""
+        self.model.policy.eval()
+        try:
+            yield
+        finally:
+            self._training_mode()
 
     def _prepare(self, step: int) -> None:
         """Rows, learning rates and seed of a step."""
@@ -317,7 +343,7 @@ class PolicyTrainer:
         rows = torch.from_numpy(chosen).to(self.device)
         total = torch.zeros((), device=self.device)
         sums = None if self._sums is None else torch.zeros_like(self._sums)
-        with _evaluating(self.model), uncompiled() if self._compiled else contextlib.nullcontext():
+        with self._evaluating(), uncompiled() if self._compiled else contextlib.nullcontext():
             torch.manual_seed(step_seed(self.recipe.seed, -1))
             for part in rows.split(size):
                 with self._precision():
@@ -326,16 +352,6 @@ class PolicyTrainer:
                 self._add(sums, part, each)
         found = zip(self.drawn, [] if sums is None else sums.tolist(), strict=True)
         return float(total / count), {name: all_of / number for name, (all_of, number) in found if number}
-
-
-@contextlib.contextmanager
-def _evaluating(model: TrainableModel) -> Iterator[None]:
-    """The policy in evaluation mode."""
-    model.policy.eval()
-    try:
-        yield
-    finally:
-        model.policy.train()
 
 
 def _optimizer(

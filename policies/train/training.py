@@ -23,7 +23,7 @@ from arena_newton.policies.train.families import families
 from arena_newton.policies.train.families.policy_model import TrainableModel
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import VECTOR_KEY, DatasetRows, read_rows, statistics
-from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames
+from arena_newton.policies.train.frames.frame_store import FrameStore, is_pad, load_frames
 from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
@@ -35,9 +35,6 @@ from arena_newton.policies.train.training_state import TrainingProgress, check_n
 
 __all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
 
-BLACK_PART = 0.5
-"""Fraction of a pad that is black in all pictures: a codec, whose blocks have 16 rows, leaves traces of the picture in
-the others. Of 224 rows 28 are a pad, of which it brightens 4 in most episodes."""
 TOKEN_ROWS = 4096
 """Rows whose prompts are made at once."""
 
@@ -114,7 +111,14 @@ def _train(
         jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
         network = network_bytes(settings, device)
         store = load_frames(
-            datasets, device, hold_out=options.hold_out, every=every, jobs=jobs, network=network, on_frames=bar.update
+            datasets,
+            device,
+            hold_out=options.hold_out,
+            every=every,
+            middle=settings.height if settings.cut_pad else 0,
+            jobs=jobs,
+            network=network,
+            on_frames=bar.update,
         )
     if options.looks:
         looks = load_looks(datasets, store, *look_fractions(options.looks), jobs=jobs, network=network)
@@ -260,8 +264,7 @@ def pair_weights(store: FrameStore, options: PolicyTrainOptions) -> list[float] 
 
 def camera_fit(store: FrameStore) -> Literal["pad", "native"]:
     """`pad` where the black rows are those around a 4:3 picture, else `native` (`CameraConfig.fit`)."""
-    band = (store.height - store.width * 3 // 4) // 2
-    return "pad" if band > 0 and min(store.top, store.bottom) >= BLACK_PART * band else "native"
+    return "pad" if is_pad(store.height, store.width * 3 // 4, store.top, store.bottom) else "native"
 
 
 def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> None:

@@ -31,10 +31,22 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 if TYPE_CHECKING:
     from arena_newton.policies.train.frames.look_store import LookStore
 
-__all__ = ["FrameStore", "assembled", "check_memory", "free_memory", "load_frames", "made_statistics", "needed_memory"]
+__all__ = [
+    "FrameStore",
+    "assembled",
+    "check_memory",
+    "free_memory",
+    "is_pad",
+    "load_frames",
+    "made_statistics",
+    "needed_memory",
+]
 
 BLACK = 12
 """Largest value of a pixel that counts as black: a video codec leaves traces of the picture in the pad next to it."""
+BLACK_PART = 0.5
+"""Fraction of a pad that is black in all pictures: a codec, whose blocks have 16 rows, leaves traces of the picture in
+the others. Of 224 rows 28 are a pad, of which it brightens 4 in most episodes."""
 HOST_BYTES = 2**30
 """Memory of the host that is left to everything else."""
 
@@ -174,6 +186,7 @@ def load_frames(
     *,
     hold_out: int = 0,
     every: int = 1,
+    middle: int = 0,
     jobs: int = 0,
     processes: int | None = None,
     network: int = 0,
@@ -186,6 +199,8 @@ def load_frames(
         device: Where the rows are wanted.
         hold_out: Last episodes of each dataset that are held out.
         every: Rows from one picture of an episode to the next.
+        middle: Height of the part about the middle of the pictures that is wanted alone, where a pad is around it [px];
+            0: all but the rows that are black in every picture.
         jobs: Cores that decode, an episode each; 0: all that the process may use.
         processes: Processes that decode instead of threads; by default as `decoding_processes` says.
         network: Memory that the network needs beside the pictures [bytes] (`network_bytes`).
@@ -214,11 +229,13 @@ def load_frames(
     processes = decoding_processes(cores, count) if processes is None else processes
     with DecoderPool(height, width, threads=cores, processes=processes, device=device) as pool:
         top, bottom = black_rows(pool, films, height)
+        if middle and is_pad(height, middle, top, bottom):
+            top = bottom = (height - middle) // 2
         while True:
             check_memory(count, rows, height - top - bottom, width, device, network)
             pictures = torch.empty((count, height - top - bottom, width, 3), dtype=torch.uint8, device=device)
             black = _decode(pool, films, pictures, (top, bottom), on_frames)
-            if black == (top, bottom):
+            if black == (top, bottom) or (middle and is_pad(height, middle, *black)):
                 break
             # Some picture is not black where the first ones of all episodes are: only what is black in all is cut off.
             del pictures
@@ -241,6 +258,12 @@ def episode_films(datasets: Sequence[DatasetRows], every: int = 1) -> list[Episo
             found.append(EpisodeFilm(dataset.root, number, part.path, part.first, count, row, every))
             row += count
     return found
+
+
+def is_pad(height: int, middle: int, top: int, bottom: int) -> bool:
+    """True where rows that are black in all pictures, above and below, are a pad around a part of some height [px]."""
+    band = (height - middle) // 2
+    return band > 0 and min(top, bottom) >= BLACK_PART * band
 
 
 def black_rows(pool: DecoderPool, films: Sequence[EpisodeFilm], height: int) -> tuple[int, int]:

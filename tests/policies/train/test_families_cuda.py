@@ -1,5 +1,6 @@
 """Losses in CUDA graphs: what a captured step computes is what it computes without one."""
 
+import dataclasses
 import gc
 
 import pytest
@@ -7,6 +8,9 @@ import torch
 
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import families
+from arena_newton.policies.train.frames.batching import BatchMaker
+from arena_newton.policies.train.policy_trainer import PolicyTrainer
+from benchmarks.made_frames import made_frames
 from tests.policies.train.made_stats import made_batch, made_stats
 
 if not torch.cuda.is_available():
@@ -59,3 +63,23 @@ def test_captured_loss_is_the_loss(family, precision):
     wanted = step()
     assert found[0] == pytest.approx(wanted.item(), rel=1e-2 if precision == "bfloat16" else 1e-4)
     assert torch.allclose(found[1], parameter.grad, rtol=0.1, atol=1e-4)
+
+
+@pytest.mark.parametrize(("precision", "latent"), [("float32", True), ("bfloat16", True), ("bfloat16", False)])
+def test_a_graph_takes_the_steps_of_plain_execution(precision, latent):
+    """On CUDA: the losses of captured steps are those of steps that are not, with dropout, latent and augmentation."""
+    losses = {}
+    for graph in (False, True):
+        network = {"use_vae": latent}
+        settings = recipe("act", "small", precision=precision, batch_size=8, steps=20, network=network)
+        settings = dataclasses.replace(settings, frozen_norms=0.75)  # after five steps
+        torch.manual_seed(0)
+        model = families.build(settings, made_stats(), "cuda:0")
+        batches = BatchMaker(made_frames(400, 64, torch.device("cuda:0")), model.normalise, model.samples)
+        trainer = PolicyTrainer(model, batches, settings, graph=graph)
+        losses[graph] = []
+        for _ in range(10):
+            trainer.advance()
+            losses[graph].append(float(trainer.loss))
+        assert trainer.graphed == graph
+    assert losses[True] == pytest.approx(losses[False], rel=2e-2)

@@ -80,7 +80,7 @@ def test_a_late_picture_keeps_its_rows(tmp_path):
         return pictures
 
     dataset = make_dataset(tmp_path, lengths=(20, 20), pictures=brightening)
-    store = load_frames([read_rows(dataset, "v3.1")], CPU)
+    store = load_frames([read_rows(dataset, "v3.1")], CPU, middle=SIZE - 2 * BAND)
     assert (store.top, store.bottom) == (0, 0) and store.pictures.shape[1] == SIZE
     assert store.pictures[15, 0].min() > 60 and store.pictures[0, 0].max() <= frame_store.BLACK
 
@@ -392,6 +392,10 @@ def test_a_codec_at_full_size_hides_no_pad(tmp_path):
     made = make_dataset(tmp_path, lengths=(12,), pictures=bright, size=224)
     store = load_frames([read_rows(made, "v3.1")], CPU, jobs=1)
     assert store.top < 26 and camera_fit(store) == "pad"
+    counted = []
+    middle = load_frames([read_rows(made, "v3.1")], CPU, jobs=1, middle=168, on_frames=counted.append)
+    assert (middle.top, middle.bottom, counted) == (28, 28, [12]) and camera_fit(middle) == "pad"
+    assert torch.equal(middle.pictures, store.middle(168)[0])
 
 
 def edit(dataset, change):
