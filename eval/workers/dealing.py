@@ -165,7 +165,9 @@ class DealtRun:
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
         self._worlds = max(1, min(self.config.flags.worlds, self._fair()))
-        """Worlds of environments."""
+        """Worlds of environments, ..."""
+        self._most = {group: len(episodes) for group, episodes in waiting.items()}
+        """... no more than a group has episodes."""
         self._losses: Counter[int] = Counter()
         """Losses of each episode while it was played alone."""
         self._given_up: Counter[Group] = Counter()
@@ -210,7 +212,8 @@ class DealtRun:
         size = min(LARGEST * worlds, max(self._worlds, self._fair())) if not level else max(1, worlds // SMALLER)
         size = 1 if level == ALONE else min(size, len(queue))
         episodes = [queue.popleft() for _ in range(size)]
-        return Assignment(self.job, group, {e.index: e for e in episodes}, self._worlds if not level else size, level)
+        worlds = size if level else min(self._worlds, self._most[group])
+        return Assignment(self.job, group, {e.index: e for e in episodes}, worlds, level)
 
     def take(self, assignment: Assignment, message: Event | Done | Lost | ArenaError) -> None:
         """Take a message of a process about its batch.

@@ -68,7 +68,7 @@ def test_episodes_do_not_know_what_ran_before(played, tmp_path):
 @pytest.fixture(scope="module")
 def modes(kept_worlds, tmp_path_factory):
     """Plays modes with some flags into a folder of a name."""
-    flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 12 --engine mujoco --strip --actions".split()
+    flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 12 --engine mujoco --record --actions".split()
     out = tmp_path_factory.mktemp("modes")
 
     def play(name, *played):
@@ -90,16 +90,15 @@ def lines(*folders):
 
 
 def test_modes_of_one_scene_play_in_one_batch(modes):
-    """Episodes of three modes in one batch have the journal lines, actions and pictures of each mode by itself."""
+    """Episodes of three modes in one batch have the journal lines and recordings, bit for bit, of each by itself."""
     together = modes("together", "base", "visual", "execution")
     alone = [modes(name, name) for name in ("base", "visual", "execution")]
     assert lines(together) == lines(*alone) and len(lines(together)) == 9
     assert len({line["margin"] for line in lines(together)}) == 6  # a light moves nothing
-    files = [path for at in alone for kind in ("strips", "actions") for path in sorted((at / kind).iterdir())]
-    drawn = {path.name: path.read_bytes() for path in files}
-    assert len(drawn) == 9 * 3 and len(set(drawn.values())) == 9 * 3
-    for path in files:
-        assert (together / path.parent.name / path.name).read_bytes() == drawn[path.name], path.name
+    files = {path.relative_to(at): path.read_bytes() for at in alone for path in at.glob("*/**/*.[nm]p[z4]")}
+    assert len(files) == 9 * 3 and len(set(files.values())) == 9 * 3
+    for name, written in files.items():
+        assert (together / name).read_bytes() == written, name
     environments = json.loads((together / "config.json").read_text())["environments"]
     assert list(environments) == [f"boxing twist2 {mode}" for mode in ("base", "visual", "execution")]
 

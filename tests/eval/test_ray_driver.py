@@ -98,6 +98,8 @@ def test_batches_cover_the_plan_once(driven, tmp_path):
     assert outcomes(records) == outcomes(read_journal(tmp_path / "one" / "episodes.jsonl")[0])
     played = [index for _, _, indices in pool.sizes for index in indices]
     assert sorted(played) == list(range(16)) and max(size for size, _, _ in pool.sizes) <= 8
+    _, pool, _ = driven(size=1, out="s", task=("boxing",), mode=(*MODES, "semantic"), worlds=99)
+    assert [(size, worlds) for size, worlds, _ in pool.sizes] == [(8, 8), (4, 4)]  # two modes share a scene
 
 
 def test_losses_lose_nothing(driven):
