@@ -94,6 +94,9 @@ class ArenaEnv:
             raise InputError(f"--variant {variant_file}: --mode {mode} has a scene of its own, choose one of the two")
         self.rules = rule_sets.get(rules) if isinstance(rules, str) else rules
         self.mode = mode
+        """Mode of episodes whose own is not named."""
+        self.modes = [mode] * worlds
+        """Mode of each world's episode."""
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
@@ -218,6 +221,7 @@ class ArenaEnv:
         *,
         spawn: Spawn | None = None,
         samples: Sequence[Mapping[str, Sample]] | None = None,
+        modes: Sequence[str] | None = None,
     ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone.
 
@@ -228,16 +232,21 @@ class ArenaEnv:
             worlds: World indices; all worlds by default.
             spawn: The robot's pose at the reset instead of the task's spawn pose.
             samples: Samples of the objects' poses instead of those that the seeds draw, one mapping per world.
+            modes: Modes of the episodes, one per world, all with this environment's scene; by default `mode`.
 
         Raises:
-            InputError: Another number of seeds or samples than of worlds, or a world that is not in the batch or named
-                twice.
+            InputError: Another number of seeds, samples or modes than of worlds, a world that is not in the batch or
+                named twice, or a mode with another scene.
         """
         rows = self._rows(worlds)
-        if len(seeds) != len(rows):
-            raise InputError(f"{len(seeds)} seeds for {len(rows)} worlds")
-        if samples is not None and len(samples) != len(rows):
-            raise InputError(f"{len(samples)} samples for {len(rows)} worlds")
+        for name, given in (("seeds", seeds), ("samples", samples), ("modes", modes)):
+            if given is not None and len(given) != len(rows):
+                raise InputError(f"{len(given)} {name} for {len(rows)} worlds")
+        for mode in set(modes or ()):
+            if self.spec.scene_name(mode, self.rules) != self.spec.scene_name(self.mode, self.rules):
+                raise InputError(
+                    f"mode {mode}: has another scene than mode {self.mode}, for which the worlds are built"
+                )
         p, h = self.physics, self.scene.robot
         qpos = p.qpos0[rows].copy()
         mocap_pos = np.tile(p.mocap_pos0, (len(rows), 1, 1))
@@ -247,9 +256,8 @@ class ArenaEnv:
         for k, (seed, world) in enumerate(zip(map(int, seeds), rows.tolist(), strict=True)):
             pose = (self.spec.spawn_position, self.spec.spawn_quat) if spawn is None else spawn(seed)
             qpos[k, h.root_qpos : h.root_qpos + 7] = np.concatenate(pose)
-            draws = self.draws[world] = self.spec.draw(
-                seed, self.mode, self.rules, None if samples is None else samples[k]
-            )
+            mode = self.modes[world] = self.mode if modes is None else modes[k]
+            draws = self.draws[world] = self.spec.draw(seed, mode, self.rules, None if samples is None else samples[k])
             for prim, placed in draws.placed.items():
                 if self.scene.has_body(f"{prim}/Frame"):
                     mocap = self.scene.mocap_id(prim)

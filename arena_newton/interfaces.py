@@ -336,7 +336,9 @@ class World(Protocol):
     loop: TrackerLoop
     """Turns actions into actuator targets; holds what was executed at the last tick."""
     mode: str
-    """Evaluation mode."""
+    """Evaluation mode of episodes whose own is not named."""
+    modes: list[str]
+    """Evaluation mode of each world's episode."""
     worlds: int
     torch_device: torch.device
     startup_ticks: int
@@ -371,6 +373,7 @@ class World(Protocol):
         *,
         spawn: Spawn | None = None,
         samples: Sequence[Mapping[str, dict[str, float]]] | None = None,
+        modes: Sequence[str] | None = None,
     ) -> None:
         """Start an episode in each of `worlds` (all by default) from its episode seed alone."""
 

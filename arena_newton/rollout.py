@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,6 +89,7 @@ class Rollout:
         latency: int = 0,
         spawn: Spawn | None = None,
         samples: Callable[[Planned], Mapping[str, dict[str, float]]] | None = None,
+        modes: Callable[[Planned], str] | None = None,
         on_finish: Callable[[EpisodeResult], None] | None = None,
         on_tick: Callable[[int], None] | None = None,
     ):
@@ -105,13 +107,15 @@ class Rollout:
                 stands.
             spawn: The robot's pose at a reset instead of the task's spawn pose.
             samples: Samples of the objects' poses of an episode instead of those that its seed draws.
+            modes: Mode of an episode instead of the environment's; both have one scene.
             on_finish: Called with each result, in the order of ending.
             on_tick: Called each tick with the number of active worlds.
         """
         self.env, self.policy = env, policy
         self._view = PolicyView(env)
         self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder
-        self.disturbance, self.spawn, self.samples = disturbance, spawn, samples
+        self.disturbance, self.spawn = disturbance, spawn
+        self._drawn = {name: draw for name, draw in (("samples", samples), ("modes", modes)) if draw is not None}
         self.budget = max_steps or env.budget
         self.on_finish, self.on_tick = on_finish, on_tick
         self.latency = latency
@@ -164,10 +168,8 @@ class Rollout:
             return
         episodes = [episode for _, episode in taken.values()]
         seeds_of = [episode.episode_seed for episode in episodes]
-        if self.samples is None:
-            env.reset(seeds_of, list(taken), spawn=self.spawn)
-        else:
-            env.reset(seeds_of, list(taken), spawn=self.spawn, samples=[self.samples(one) for one in episodes])
+        drawn: dict[str, Any] = {name: [draw(one) for one in episodes] for name, draw in self._drawn.items()}
+        env.reset(seeds_of, list(taken), spawn=self.spawn, **drawn)
         mask, seeds = np.zeros(env.worlds, dtype=bool), [0] * env.worlds
         for world, (index, episode) in taken.items():
             self._running[world] = _Running(index, episode, time.perf_counter())

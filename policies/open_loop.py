@@ -37,7 +37,7 @@ class RecordedEpisodes(Policy):
         self.path = Path()
         self.playing: list[np.ndarray | None] = []
         """Actions of each world, shape [ticks, 40]."""
-        self._mode = "base"
+        self._world: World | None = None
         self._asked: list[tuple[str, str, int]] = []
         self._steps = np.zeros(0, dtype=np.int64)
 
@@ -46,16 +46,17 @@ class RecordedEpisodes(Policy):
         raise NotImplementedError
 
     def attach(self, env: World) -> None:
-        """Take the mode whose recordings are played."""
-        self._mode = getattr(env, "mode", "base")
+        """Take the worlds, in whose modes recordings are played."""
+        self._world = env
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Take the recordings of the worlds in `mask`."""
         if len(self._steps) != len(seeds):
             self._steps = np.zeros(len(seeds), dtype=np.int64)
             self.playing, self._asked = [None] * len(seeds), [("", "", 0)] * len(seeds)
+        modes = ["base"] * len(seeds) if self._world is None else self._world.modes
         for world in np.flatnonzero(world_mask(mask, len(seeds))):
-            self._asked[world] = (tasks[world], self._mode, int(seeds[world]))
+            self._asked[world] = (tasks[world], modes[world], int(seeds[world]))
             self.playing[world] = self.recording(*self._asked[world])
             self._steps[world] = 0
 

@@ -21,7 +21,7 @@ from arena_newton.interfaces import World
 
 __all__ = ["PolicyView"]
 
-OF_WORLD = """spec mode rules worlds device torch_device engine startup_ticks tick active budget camera_config
+OF_WORLD = """spec mode modes rules worlds device torch_device engine startup_ticks tick active budget camera_config
     camera_configs""".split()
 """Attributes of a `World` that a policy may read, besides `scene`, `physics`, the tracker's name and those that a class
 of worlds names in `shown`."""

@@ -385,6 +385,10 @@ class TaskSpec:
         _check_mode(mode)
         return rules.task(self.name).semantic_variant if mode == "semantic" else "base"
 
+    def scene_name(self, mode: str, rules: RuleSet) -> str:
+        """Name of the scene of a mode: modes of one name share it, and differ in placements and lights alone."""
+        return mode if mode in HELD_OUT else self.variant(mode, rules)
+
     def own_layer(self, mode: str) -> Path | None:
         """The layer that replaces the scene in this mode; None: the mode selects a `variant` of the scene.
 

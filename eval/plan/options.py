@@ -86,7 +86,7 @@ class Conditions:
 
     mode: Several[str] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual, and the held-out looks
-    semantic-2 semantic-3."""
+    semantic-2 semantic-3. Modes with one scene (base execution visual) play in one batch of worlds."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"

@@ -1,4 +1,4 @@
-"""Cache of environments for runs that follow each other: the same one again is not built again.
+"""Cache of environments for runs that follow each other: the same one again, or its scene, is not built again.
 
 Building an environment takes seconds, for runs of a minute. An episode begins from its seed alone, so what ran before
 in the same environment does not change it; a test compares them bit for bit.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import json
 
+from arena_newton import rule_sets, tasks
 from arena_newton.env import ArenaEnv
 from arena_newton.trackers.base import Tracker
 
@@ -38,17 +39,22 @@ class EnvCache:
         self.built = 0
         """Environments built so far."""
 
-    def __call__(self, task: str, *, tracker: Tracker, **options: object) -> CachedEnv:
+    def __call__(
+        self, task: str, *, tracker: Tracker, mode: str = "base", rules: str = "paper", **options: object
+    ) -> CachedEnv:
         """Environment of a run, whose arguments are those of `ArenaEnv`.
 
-        A tracker whose description equals the last one's is taken to be the same.
+        A tracker whose description equals the last one's is taken to be the same; modes that share a scene share the
+        environment.
         """
         description = json.dumps(tracker.describe(), sort_keys=True, default=str)
-        key = (task, type(tracker), description, tuple(sorted(options.items(), key=lambda item: item[0])))
+        scene = tasks.get(task).scene_name(mode, rule_sets.get(rules))
+        key = (task, type(tracker), description, rules, scene, sorted(options.items(), key=lambda item: item[0]))
         if self._env is None or self._key != key:
             self.drop()
-            self._env = self._kind(task, tracker=tracker, **options)  # type: ignore[arg-type]  # as the caller names them
+            self._env = self._kind(task, tracker=tracker, mode=mode, rules=rules, **options)  # type: ignore[arg-type]
             self._key, self.built = key, self.built + 1
+        self._env.mode = mode
         return self._env
 
     def drop(self) -> None:

@@ -1,4 +1,4 @@
-"""Run a plan: validate, build one environment per task, tracker and mode, journal every episode, write the report."""
+"""Run a plan: validate, build one environment per task, tracker and scene, journal every episode, write the report."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import errno
 import functools
 import gc
 import math
+import operator
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -252,7 +253,7 @@ class RunPlayer:
 
         Args:
             ended: Finished episodes by number.
-            waiting: Those to play, by task, tracker and mode.
+            waiting: Those to play, by group.
         """
         self.ended = ended
         shown = self.progress = progress_of(self.config, ended, waiting)
@@ -265,7 +266,7 @@ class RunPlayer:
             shown.close()
 
     def play_group(self, group: str, episodes: list[Episode]) -> None:
-        """Run the episodes of one task, tracker and mode, which name the group.
+        """Run the episodes of a group, which has a name.
 
         What breaks an environment as a whole says nothing about its episodes: it stops the run and leaves them
         unplayed. On --skip-broken those that were running end as errors, and the rest goes on in a new environment.
@@ -308,7 +309,9 @@ class RunPlayer:
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
-            facts = self.folder.register(group, env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()})
+            own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()}
+            for names in groups(order):
+                facts = self.folder.register(" ".join(names), own)
             if flags.verbose:
                 self.progress.say(console.environment(group, facts))
             recorder = _recorder(config, self.folder.path, tracker)
@@ -353,6 +356,7 @@ class RunPlayer:
                     recorder=recorders,
                     disturbance=noise,
                     max_steps=episodes[0].max_steps,
+                    modes=operator.attrgetter("mode"),
                     latency=flags.latency_ticks,
                     on_finish=on_finish,
                     on_tick=on_tick,
@@ -360,7 +364,7 @@ class RunPlayer:
                 if files is not None:
                     self._keep_saved(files, keep, wait=True)
                     files.check()
-                episodes = self._next_round(task, tracker, mode, order, left)
+                episodes = self._next_round(group, order, left)
         finally:
             try:
                 if files is not None:  # what has ended is kept, whatever happened to the others
@@ -372,13 +376,11 @@ class RunPlayer:
                 env = recorder = files = None
                 gc.collect()
 
-    def _next_round(
-        self, task: str, tracker: str, mode: str, order: list[Episode], left: dict[int, Episode]
-    ) -> list[Episode]:
+    def _next_round(self, group: str, order: list[Episode], left: dict[int, Episode]) -> list[Episode]:
         """More attempts where successes are missing; they are added to what is left."""
         if self.config.flags.keep is None and self.config.width_rule is None:
             return []
-        more = due(self.config, self.ended).get((task, tracker, mode), [])
+        more = next((found for names, found in due(self.config, self.ended).items() if " ".join(names) == group), [])
         order += more
         left |= {episode.index: episode for episode in more}
         self.progress.more([episode.max_steps for episode in more])

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arena_newton import rule_sets, tasks
 from arena_newton.cli.flags import shell_command
 from arena_newton.errors import ArenaError
 from arena_newton.eval.folders.results import Results, RunRecord, load_run
@@ -33,6 +34,7 @@ __all__ = [
     "check_again",
     "command",
     "due",
+    "group_of",
     "groups",
     "kept",
     "progress_of",
@@ -41,7 +43,7 @@ __all__ = [
 ]
 
 Group = tuple[str, str, str]
-"""Task, tracker and mode, whose episodes run in one environment."""
+"""Task, tracker, and mode or modes with a space between, whose episodes run in one environment."""
 
 
 class RunStopped(ArenaError):
@@ -80,14 +82,27 @@ def groups(episodes: Iterable[Episode]) -> dict[Group, list[Episode]]:
     return found
 
 
+def group_of(config: RunConfig, episode: Episode) -> Group:
+    """Group in which an episode is played: with the modes of the run that share its scene.
+
+    Each mode is played by itself where a policy depends on the number of worlds, or is of another package and sees the
+    world, so that it may not know that worlds differ in their modes; and for a viewer, which shows one mode at a time.
+    """
+    spec, rules = tasks.get(episode.task), rule_sets.get(episode.rules)
+    shared = [m for m in config.flags.mode if spec.scene_name(m, rules) == spec.scene_name(episode.mode, rules)]
+    foreign = config.privileged and "code" in (config.policy_facts or {})
+    alone = config.worlds_matter or foreign or config.flags.viewer is not None
+    return episode.task, episode.tracker, episode.mode if alone else " ".join(shared)
+
+
 def begun(
     config: RunConfig, folder: ResultsFolder, journal: Journal
 ) -> tuple[dict[int, EpisodeRecord], dict[Group, list[Episode]]]:
     """Say what is to be played in a folder that was prepared.
 
     Returns:
-        Finished episodes by number, and those to play next, by task, tracker and mode; where none are left the folder
-        is that of a finished run.
+        Finished episodes by number, and those to play next, by group; where none are left the folder is that of a
+        finished run.
     """
     if journal.torn_bytes:
         print(f"  cut a torn last line of {counted(journal.torn_bytes, 'byte')} off the journal", file=sys.stderr)
@@ -124,13 +139,13 @@ def _finished_episodes(config: RunConfig, folder: Path, records: Sequence[Episod
 
 
 def due(config: RunConfig, ended: Mapping[int, EpisodeRecord]) -> dict[Group, list[Episode]]:
-    """Episodes to play next, by task, tracker and mode."""
+    """Episodes to play next, by group."""
     outcomes = {index: record.outcome for index, record in ended.items()}
-    found = {}
-    for names, group in groups(config.episodes).items():
-        wanted = set(rounds.due([e.index for e in group], outcomes, config.flags.keep, config.width_rule))
+    found: dict[Group, list[Episode]] = {}
+    for cell in groups(config.episodes).values():
+        wanted = set(rounds.due([e.index for e in cell], outcomes, config.flags.keep, config.width_rule))
         if wanted:
-            found[names] = [episode for episode in group if episode.index in wanted]
+            found.setdefault(group_of(config, cell[0]), []).extend(e for e in cell if e.index in wanted)
     return found
 
 

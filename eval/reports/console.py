@@ -21,7 +21,7 @@ __all__ = ["announce", "broken", "environment", "failed", "result"]
 def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, str], Sequence[Episode]]) -> None:
     """Print configuration and size of the run in two lines, or the configuration as a whole.
 
-    `waiting` are the episodes to play, by task, tracker and mode.
+    `waiting` are the episodes to play, by the groups in which they run.
     """
     flags = config.flags
     if flags.verbose:
@@ -73,7 +73,8 @@ def broken(group: str, message: str, running: Sequence[Episode]) -> str:
     if "out of memory" in message.lower() or message.startswith("MemoryError"):
         text += " (fewer --worlds need less)"
     if running:
-        seeds = " ".join(f"s{e.group_seed}/r{e.repeat}" for e in running[:8]) + (" ..." if len(running) > 8 else "")
+        seeds = " ".join(f"{e.mode}/s{e.group_seed}/r{e.repeat}" for e in running[:8])
+        seeds += " ..." if len(running) > 8 else ""
         text += f"; running were {seeds}, which stay unplayed (--worlds 1 --skip-broken passes one that always breaks)"
     return f"{text}; trace in {BREAK_FILE}"
 

@@ -25,6 +25,8 @@ from arena_newton.eval.play.run_flow import (
     check_again,
     command,
     due,
+    group_of,
+    groups,
     kept,
     naming_the_command,
     progress_of,
@@ -151,7 +153,7 @@ class DealtRun:
             journal: Its journal.
             pool: Who plays.
             ended: Finished episodes by number.
-            waiting: Those to play by task, tracker and mode.
+            waiting: Those to play by group.
             shown: What shows how far all is.
             besides: Episodes of other runs that nobody plays yet.
         """
@@ -163,10 +165,13 @@ class DealtRun:
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
         self._worlds = max(1, min(self.config.flags.worlds, self._fair()))
-        """Worlds of environments."""
+        """Worlds of environments, ..."""
+        self._most = {group: len(episodes) for group, episodes in waiting.items()}
+        """... no more than a group has episodes."""
         self._losses: Counter[int] = Counter()
         """Losses of each episode while it was played alone."""
         self._given_up: Counter[Group] = Counter()
+        """Episodes given up, by task, tracker and mode."""
 
     @property
     def waiting(self) -> int:
@@ -207,7 +212,8 @@ class DealtRun:
         size = min(LARGEST * worlds, max(self._worlds, self._fair())) if not level else max(1, worlds // SMALLER)
         size = 1 if level == ALONE else min(size, len(queue))
         episodes = [queue.popleft() for _ in range(size)]
-        return Assignment(self.job, group, {e.index: e for e in episodes}, self._worlds if not level else size, level)
+        worlds = size if level else min(self._worlds, self._most[group])
+        return Assignment(self.job, group, {e.index: e for e in episodes}, worlds, level)
 
     def take(self, assignment: Assignment, message: Event | Done | Lost | ArenaError) -> None:
         """Take a message of a process about its batch.
@@ -216,7 +222,8 @@ class DealtRun:
             ArenaError: The run cannot go on.
         """
         if isinstance(message, Built):
-            self.folder.register(" ".join(assignment.group), message.facts)
+            for names in groups(assignment.left.values()):
+                self.folder.register(" ".join(names), message.facts)
             assignment.built = True
         elif isinstance(message, Ticks):
             self.shown.tick(message.count)
@@ -242,7 +249,7 @@ class DealtRun:
         self.journal.append(record)
         self.ended[record.index] = record
         if self.config.flags.keep is not None or self.config.width_rule is not None:
-            self._next_round((episode.task, episode.tracker, episode.mode))
+            self._next_round(group_of(self.config, episode))
 
     def _next_round(self, group: Group) -> None:
         """More attempts where successes are missing, when all of a round have ended."""
@@ -279,7 +286,8 @@ class DealtRun:
 
     def _give_up(self, assignment: Assignment, episode: Episode, cause: str) -> None:
         """End an episode as an error: it takes its process with it."""
-        facts, now = self.folder.document["environments"][" ".join(assignment.group)], iso(time.time())
+        cell = episode.task, episode.tracker, episode.mode
+        facts, now = self.folder.document["environments"][" ".join(cell)], iso(time.time())
         attempts = f"played alone {self._losses[episode.index]} times, each time its process was lost"
         planned = dataclasses.asdict(episode)
         del planned["rank"]
@@ -301,12 +309,7 @@ class DealtRun:
         self.shown.say(f"  {episode.key} ends as an error: {record.error}")
         self._append(episode, record)
         self.shown.episode(episode.max_steps, 0)
-        self._given_up[assignment.group] += 1
-        played = any(
-            (one.task, one.tracker, one.mode) == assignment.group and one.outcome != "error"
-            for one in self.ended.values()
-        )
-        if self._given_up[assignment.group] >= GIVEN_UP and not played:
-            raise RunStopped(
-                f"{' '.join(assignment.group)}: {GIVEN_UP} episodes and no other: {cause}; see {BREAK_FILE}"
-            )
+        self._given_up[cell] += 1
+        played = any((e.task, e.tracker, e.mode) == cell and e.outcome != "error" for e in self.ended.values())
+        if self._given_up[cell] >= GIVEN_UP and not played:
+            raise RunStopped(f"{' '.join(cell)}: {GIVEN_UP} episodes and no other: {cause}; see {BREAK_FILE}")

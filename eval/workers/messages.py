@@ -43,10 +43,10 @@ class Opened:
 
 @dataclass(frozen=True)
 class EpisodeBatch:
-    """Episodes of one task, tracker and mode that a process plays."""
+    """Episodes that a process plays in one environment."""
 
     group: str
-    """Task, tracker and mode as in config.json."""
+    """Name of their group."""
     episodes: tuple[int, ...]
     """Their numbers in the plan."""
     worlds: int

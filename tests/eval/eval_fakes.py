@@ -41,13 +41,14 @@ class FakeEnv:
         self.spec, self.rules = tasks.get(task), rule_sets.get(rules)
         self.budget = self.spec.max_steps(self.rules)
         self.tick, self.active = np.zeros(worlds, np.int64), np.zeros(worlds, bool)
-        self.seeds = np.zeros(worlds, np.int64)
+        self.seeds, self.modes = np.zeros(worlds, np.int64), [mode] * worlds
         self.ended = 0
         """Episodes whose world got the next one."""
 
-    def reset(self, seeds, worlds=None, *, spawn=None, samples=None):
+    def reset(self, seeds, worlds=None, *, spawn=None, samples=None, modes=None):
         worlds = range(self.worlds) if worlds is None else worlds
-        for world, seed in zip(worlds, seeds, strict=True):
+        for world, seed, mode in zip(worlds, seeds, modes or self.modes, strict=modes is not None):
+            self.modes[world] = mode
             self.ended += bool(self.tick[world])
             self.seeds[world], self.tick[world], self.active[world] = seed, 0, True
 

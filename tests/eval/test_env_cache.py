@@ -1,13 +1,17 @@
-"""One environment for runs that follow each other: episodes are the same to the last bit."""
+"""One environment for runs that follow each other, or for modes: episodes are the same to the last bit."""
 
+import dataclasses
 import json
 
 import pytest
 
 from arena_newton import trackers
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.run_flow import group_of
 from arena_newton.eval.suites.suite_records import read_suite
 
 SUITE = """
@@ -61,6 +65,64 @@ def test_episodes_do_not_know_what_ran_before(played, tmp_path):
     assert still == alone and first == again != still  # the first cell began in a new one
 
 
+@pytest.fixture(scope="module")
+def modes(kept_worlds, tmp_path_factory):
+    """Plays modes with some flags into a folder of a name."""
+    flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 12 --engine mujoco --record --actions".split()
+    out = tmp_path_factory.mktemp("modes")
+
+    def play(name, *played):
+        said = ["run", *flags, "--policy", "expert", "--mode", *played, "--out", str(out / name)]
+        assert main(said, Factories(env=kept_worlds)) == 0
+        return out / name
+
+    return play
+
+
+def lines(*folders):
+    """Lines of journals without numbers of the plan, times and hash of the plan, by mode and repeat."""
+    found = [json.loads(line) for at in folders for line in (at / "episodes.jsonl").read_text().splitlines()]
+    for line in found:
+        for key in ("index", "durations", "started_at", "finished_at"):
+            del line[key]
+        del line["hashes"]["config"]
+    return sorted(found, key=lambda line: (line["mode"], line["repeat"]))
+
+
+def test_modes_of_one_scene_play_in_one_batch(modes):
+    """Episodes of three modes in one batch have the journal lines and recordings, bit for bit, of each by itself."""
+    together = modes("together", "base", "visual", "execution")
+    alone = [modes(name, name) for name in ("base", "visual", "execution")]
+    assert lines(together) == lines(*alone) and len(lines(together)) == 9
+    assert len({line["margin"] for line in lines(together)}) == 6  # a light moves nothing
+    files = {path.relative_to(at): path.read_bytes() for at in alone for path in at.glob("*/**/*.[nm]p[z4]")}
+    assert len(files) == 9 * 3 and len(set(files.values())) == 9 * 3
+    for name, written in files.items():
+        assert (together / name).read_bytes() == written, name
+    environments = json.loads((together / "config.json").read_text())["environments"]
+    assert list(environments) == [f"boxing twist2 {mode}" for mode in ("base", "visual", "execution")]
+
+
+@pytest.mark.parametrize(
+    ("change", "semantic", "base"),
+    [
+        ({}, "semantic", "base execution visual"),
+        ({"worlds_matter": True}, "semantic", "base"),
+        ({"policy_facts": {"privileged": True}}, "semantic", "base execution visual"),
+        ({"policy_facts": {"privileged": True, "code": "of another package"}}, "semantic", "base"),
+        ({"viewer": "usd"}, "semantic", "base"),
+    ],
+)
+def test_modes_that_play_together(change, semantic, base):
+    """Modes with one scene, unless the policy could take one for another or a viewer shows them."""
+    played = ("base", "semantic", "execution", "visual")
+    options = RunOptions(task=("boxing",), mode=played, seeds=(0,), repeats=1, engine="mujoco")
+    config = resolve(dataclasses.replace(options, viewer=change.pop("viewer", None)))
+    groups = [group_of(dataclasses.replace(config, **change), one) for one in config.episodes]
+    assert groups[:2] == [("boxing", "twist2", base), ("boxing", "twist2", semantic)]
+    assert (groups[2] == groups[0]) == (groups[3] == groups[0]) == (base != "base")
+
+
 class Stub:
     """An environment that holds nothing."""
 
@@ -72,14 +134,15 @@ class Stub:
 
 
 def test_another_environment_is_built():
-    """Another number of worlds, another mode or what was dropped is built again; the same is handed out again."""
+    """Another number of worlds, another scene or what was dropped is built again; the same is handed out again."""
     cache, pd = EnvCache(Stub), trackers.get("pd")
     first = cache("boxing", tracker=pd, worlds=1, mode="base")
     assert cache("boxing", tracker=trackers.get("pd"), worlds=1, mode="base") is first and cache.built == 1
-    for worlds, mode in ((2, "base"), (1, "visual"), (1, "base")):
+    for worlds, mode in ((2, "base"), (1, "semantic"), (1, "base")):
         last = first
         first = cache("boxing", tracker=pd, worlds=worlds, mode=mode)
         assert first is not last
+    assert cache("boxing", tracker=pd, worlds=1, mode="visual") is first and first.mode == "visual"
     assert cache.built == 4
     cache.drop()
     assert cache("boxing", tracker=pd, worlds=1, mode="base") is not first

@@ -22,7 +22,9 @@ from arena_newton.physics import devices
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 
-PLAN = {"task": ("football", "boxing"), "seeds": (0, 1), "repeats": 4, "engine": "mujoco", "worlds": 4, "ray": ()}
+MODES = ("base", "execution")
+PLAN = {"task": ("football", "boxing"), "mode": MODES, "seeds": (0, 1), "repeats": 2}
+PLAN |= {"engine": "mujoco", "worlds": 4, "ray": ()}
 
 
 class StubPool:
@@ -91,11 +93,13 @@ def outcomes(records):
 def test_batches_cover_the_plan_once(driven, tmp_path):
     """All episodes are played once in batches of at most twice the worlds, with a run's outcomes."""
     records, pool, _ = driven()
-    assert main(["run", "--task", "football", "boxing", "--seeds", "0", "1", "--repeats", "4", "--engine", "mujoco",
-                 "--out", str(tmp_path / "one")], factories()) == 0  # fmt: skip
+    plan = ["--task", "football", "boxing", "--mode", *MODES, "--seeds", "0", "1", "--repeats", "2"]
+    assert main(["run", *plan, "--engine", "mujoco", "--out", str(tmp_path / "one")], factories()) == 0
     assert outcomes(records) == outcomes(read_journal(tmp_path / "one" / "episodes.jsonl")[0])
     played = [index for _, _, indices in pool.sizes for index in indices]
     assert sorted(played) == list(range(16)) and max(size for size, _, _ in pool.sizes) <= 8
+    _, pool, _ = driven(size=1, out="s", task=("boxing",), mode=(*MODES, "semantic"), worlds=99)
+    assert [(size, worlds) for size, worlds, _ in pool.sizes] == [(8, 8), (4, 4)]  # two modes share a scene
 
 
 def test_losses_lose_nothing(driven):
@@ -147,7 +151,8 @@ def test_a_poison_episode_ends_as_an_error_and_the_rest_goes_on(driven):
 def test_where_every_episode_breaks_the_run_stops(driven):
     """A bug of policy or simulator does not end the whole plan as errors."""
     with pytest.raises(RunStopped, match="boxing twist2 base: 5 episodes and no other: device lost"):
-        driven(lambda assignment, told: (1, Lost("device lost", "a trace")), worlds=1, ray_attempts=1, task=("boxing",))
+        cell = {"task": ("boxing",), "mode": ("base",), "repeats": 5}
+        driven(lambda assignment, told: (1, Lost("device lost", "a trace")), worlds=1, ray_attempts=1, **cell)
 
 
 def test_a_loss_before_the_environment_is_built_blames_no_episode(driven):

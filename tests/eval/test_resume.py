@@ -199,11 +199,11 @@ class BreaksOnce(FakeEnv):
 @pytest.mark.parametrize(
     ("error", "says"),
     [
-        (RuntimeError("device lost"), "boxing twist2 base: RuntimeError: device lost; running were s0/r1 s0/r3 s1/r0"),
+        (RuntimeError("device lost"), "device lost; running were base/s0/r1 base/s0/r3 base/s1/r0"),
         (RuntimeError("CUDA out of memory"), "fewer --worlds"),
-        (SystemExit(0), "boxing twist2 base: SystemExit: 0; running were"),
+        (SystemExit(0), "boxing twist2 base execution: SystemExit: 0; running were"),
         (OSError(errno.ENOSPC, "No space left on device", "v.mp4.part"), "v.mp4.part: disk full"),
-        (ConnectionResetError("peer left"), "boxing twist2 base: ConnectionResetError: peer left"),
+        (ConnectionResetError("peer left"), "boxing twist2 base execution: ConnectionResetError: peer left"),
         (PolicyUnavailable("http://host:1 does not\x1b[2J answer"), "http://host:1 does not answer"),
     ],
 )
@@ -224,12 +224,12 @@ def test_a_break_stops_the_run_and_leaves_episodes_unplayed(tmp_path, uninterrup
 class Poison(FakeEnv):
     """Breaks whenever one certain episode of boxing starts."""
 
-    def reset(self, seeds, worlds=None, **options):
-        """The poison is known by its seed; both modes have it."""
+    def reset(self, seeds, worlds=None, *, modes, **options):
+        """The poison is known by its mode and its seed, which both modes have."""
         poison = seeding.episode_seed(self.spec.gym_id, 1, 1)
-        if (self.task, self.mode) == ("boxing", "base") and poison in seeds:
+        if self.task == "boxing" and (poison, "base") in zip(seeds, modes, strict=True):
             raise RuntimeError("always here")
-        super().reset(seeds, worlds, **options)
+        super().reset(seeds, worlds, modes=modes, **options)
 
 
 def test_an_episode_that_always_breaks_can_be_passed(tmp_path, uninterrupted, capsys):
@@ -260,7 +260,8 @@ def test_an_environment_that_cannot_be_built_is_no_error_of_episodes(tmp_path, c
 
     folder = tmp_path / "d"
     assert main(["run", *FLAGS, "--skip-broken", "--out", str(folder)], factories(env=no_memory)) == 2
-    assert "football twist2 base: MemoryError: no room (fewer --worlds need less); trace in" in capsys.readouterr().err
+    said = "football twist2 base execution: MemoryError: no room (fewer --worlds need less); trace in"
+    assert said in capsys.readouterr().err
     assert "no_memory" in (folder / "break.txt").read_text()
     assert lines(folder) == 0
 
@@ -415,9 +416,9 @@ def test_a_run_has_a_status(tmp_path, uninterrupted, capsys):
     assert main(["resume", str(folder)], factories(env=Watched)) == 2
     assert (
         status(folder)["state"] == "error"
-        and "football twist2 base: RuntimeError: device lost" in status(folder)["error"]
+        and "football twist2 base execution: RuntimeError: device lost" in status(folder)["error"]
     )
-    assert "The run ended with an error: football twist2 base: RuntimeError: device lost" in shown()
+    assert "The run ended with an error: football twist2 base execution: RuntimeError: device lost" in shown()
     before = status(folder)
     Watched.stop = InputError("not that world")
     assert main(["resume", str(folder)], factories(env=Watched)) == 2

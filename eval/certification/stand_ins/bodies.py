@@ -255,9 +255,10 @@ class GlidingEnv(ArenaEnv):
         *,
         spawn: Spawn | None = None,
         samples: Sequence[Mapping[str, Sample]] | None = None,
+        modes: Sequence[str] | None = None,
     ) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, spawn=spawn, samples=samples)
+        super().reset(seeds, worlds, spawn=spawn, samples=samples, modes=modes)
         mask = np.zeros(self.worlds, dtype=bool)
         mask[slice(None) if worlds is None else worlds] = True
         self.base.begin(torch.from_numpy(mask).to(self.torch_device))

@@ -448,9 +448,10 @@ class RelocatingEnv(ArenaEnv):
         *,
         spawn: Spawn | None = None,
         samples: Sequence[Mapping[str, Sample]] | None = None,
+        modes: Sequence[str] | None = None,
     ) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, spawn=spawn, samples=samples)
+        super().reset(seeds, worlds, spawn=spawn, samples=samples, modes=modes)
         self.relocated[slice(None) if worlds is None else list(worlds)] = 0.0
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:

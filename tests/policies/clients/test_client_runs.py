@@ -24,8 +24,8 @@ class FollowingEnv(FakeEnv):
         super().__init__(task, **options)
         self.body = np.zeros(self.worlds)
 
-    def reset(self, seeds, worlds=None, *, spawn=None):
-        super().reset(seeds, worlds, spawn=spawn)
+    def reset(self, seeds, worlds=None, **options):
+        super().reset(seeds, worlds, **options)
         self.body[list(range(self.worlds) if worlds is None else worlds)] = 0.0
 
     def observe(self, mask=None, *, image=False):
