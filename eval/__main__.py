@@ -31,6 +31,7 @@ COMMANDS = {
     ),
     "record": CommandRow("record demonstrations for datasets, or more cameras with --from <out>"),
     "report": CommandRow("write tables and report again from the journal; one table of several runs", *RUNS),
+    "audit": CommandRow("check results: lines, links, actions and tables of a folder against each other", *RUNS),
     "film": CommandRow("one success per task as a film or a picture", *RUNS),
     "tables": CommandRow("the paper's tables from suites and runs, next to the paper's numbers", *RUNS),
     "compare": CommandRow("compare policies by their episodes: tests, intervals, who won which", *RUNS),

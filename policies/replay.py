@@ -107,7 +107,8 @@ class ReplayEpisodes(RecordedEpisodes):
         """Actions by Gym id, mode and the seed that a policy is given."""
         files = sorted(self.path.glob("*.npz"))
         if not files:
-            raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; run --actions writes them")
+            of_several = "a run through several trackers has a folder for each"
+            raise InputError(f"--policy replay:{folder}: no recordings (.npz) here; {of_several}")
         for file in files:
             actions = load_actions(file)
             arrays = read_arrays(file, ("task", "mode", "episode_seed"), where=f"--policy replay:{file}")

@@ -19,7 +19,11 @@ from arena_newton.files.own_files import file_label
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.pages.tables import Table
 
-__all__ = ["SUMMARY_COLUMNS", "episode_json", "final_csv", "summary_json", "write_original"]
+__all__ = ["ORIGINAL", "SUMMARY_COLUMNS", "episode_json", "final_csv", "original_files", "summary_json"]
+__all__ += ["write_original"]
+
+ORIGINAL = "original"
+"""Folder of these files."""
 
 SUMMARY_COLUMNS = tuple(
     """task model_path model_label seed repeat_idx episode_seed episode_index
@@ -154,30 +158,43 @@ def _csv(rows: Iterable[JsonObject], columns: Sequence[str]) -> str:
     return Table(columns, [[row[name] for name in columns] for row in rows]).csv()
 
 
-def write_original(
-    folder: Path, records: Sequence[EpisodeRecord], *, gym_ids: Mapping[str, str], seeds: Sequence[int], repeats: int
-) -> None:
-    """Write the original's files for every task, tracker and mode among `records` (sorted by plan order).
+def original_files(
+    records: Sequence[EpisodeRecord], gym_ids: Mapping[str, str], seeds: Sequence[int], repeats: int
+) -> dict[str, str]:
+    """Texts of the original's files of every task, tracker and mode among records, by path below `original/`.
 
-    Raises:
-        InputError: A record's names would lead out of `folder`, or a folder inside is a link to another one.
+    Args:
+        records: Episodes in the plan's order.
+        gym_ids: Gym ids by task.
+        seeds: Group seeds of the plan.
+        repeats: Episodes of each.
     """
-    inside = folder.parent.resolve() / folder.name
-
-    def write(path: Path, text: str) -> None:
-        if not path.resolve().is_relative_to(inside):
-            raise InputError(f"{path}: lies outside {folder}; nothing is written there")
-        write_atomic(path, text)
-
+    found: dict[str, str] = {}
     for task, tracker, mode in dict.fromkeys((r.task, r.tracker, r.mode) for r in records):
         own = [r for r in records if (r.task, r.tracker, r.mode) == (task, tracker, mode)]
-        run = folder / f"{task}__{file_label(tracker)}__{mode}"
+        run = f"{task}__{file_label(tracker)}__{mode}"
         rows = [_row(record, gym_ids[task], seeds, repeats) for record in own]
         for record in own:
             content = episode_json(record, gym_ids[task], seeds, repeats)
             name = "{model_label}__seed_{seed}__repeat_{repeat_idx}__episode_{episode_index}.json".format(**content)
-            write(run / "episodes" / name, json.dumps(content, indent=2) + "\n")
-        write(run / "summary.csv", _csv(rows, SUMMARY_COLUMNS))
-        write(run / "summary.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
-        write(run / "summary.json", json.dumps(summary_json(own, repeats), indent=2) + "\n")
-        write(run / "final.csv", final_csv(own))
+            found[f"{run}/episodes/{name}"] = json.dumps(content, indent=2) + "\n"
+        found[f"{run}/summary.csv"] = _csv(rows, SUMMARY_COLUMNS)
+        found[f"{run}/summary.jsonl"] = "".join(json.dumps(row) + "\n" for row in rows)
+        found[f"{run}/summary.json"] = json.dumps(summary_json(own, repeats), indent=2) + "\n"
+        found[f"{run}/final.csv"] = final_csv(own)
+    return found
+
+
+def write_original(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write the original's files, texts by path, below a folder.
+
+    Raises:
+        InputError: A path leads out of `folder`, or a folder inside is a link to another one.
+        StorageError: A file cannot be written.
+    """
+    inside = folder.parent.resolve() / folder.name
+    for name, text in texts.items():
+        path = folder / name
+        if not path.resolve().is_relative_to(inside):
+            raise InputError(f"{path}: lies outside {folder}; nothing is written there")
+        write_atomic(path, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +20,7 @@ OUTCOMES_FILE = "outcomes.jsonl"
 """File of the episodes that LeRobot's command line played: a line with outcome, reason, steps and margin of each."""
 
 
-def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: int, gym_id: str, mode: str) -> None:
+def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: int, gym_id: str, mode: str) -> str:
     """Write the actions that an episode executed, as `--policy replay:` reads them.
 
     Args:
@@ -28,6 +29,9 @@ def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: in
         episode_seed: The episode's seed.
         gym_id: The task's Gym id.
         mode: One of `rule_types.MODES`.
+
+    Returns:
+        SHA-256 of the file.
 
     Raises:
         StorageError: The file cannot be written.
@@ -43,19 +47,22 @@ def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: in
             )
     except OSError as error:
         raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 class ActionRecorder(Recorder):
     """Keeps a policy's actions until their episode ends, then writes them."""
 
-    def __init__(self, folder: Path):
-        """Write into a folder: `<task>_<mode>_s<group seed>_r<repeat>.npz`.
+    def __init__(self, folder: Path, inside: str = "actions"):
+        """Write into a folder inside a results folder: `<task>_<mode>_s<group seed>_r<repeat>.npz`.
 
         The files hold the arrays `action` [ticks, 40] and `episode_seed`, and the texts `task`, the task's Gym id, and
         `mode`.
         """
-        self.folder = folder
+        self.folder, self.inside = folder, inside
         self._actions: dict[int, list[np.ndarray]] = {}
+        self._written: dict[int, tuple[str, str]] = {}
+        """Path below the results folder, and SHA-256, by the episode's number."""
 
     def start(self, env: World, world: int, episode: Episode) -> None:
         """An episode without actions yet."""
@@ -76,6 +83,17 @@ class ActionRecorder(Recorder):
         actions = self._actions.pop(world)
         if result.steps < 1:
             return
-        episode = result.episode
-        path = self.folder / f"{episode.key.replace('/', '_')}.npz"
-        write_actions(path, actions, episode_seed=episode.episode_seed, gym_id=env.spec.gym_id, mode=episode.mode)
+        episode, gym_id = result.episode, env.spec.gym_id
+        name = f"{self.inside}/{episode.key.replace('/', '_')}.npz"
+        seed, mode = episode.episode_seed, episode.mode
+        digest = write_actions(self.folder / name, actions, episode_seed=seed, gym_id=gym_id, mode=mode)
+        self._written[episode.index] = name, digest
+
+    def taken(self, index: int) -> tuple[dict[str, str], str | None]:
+        """Path of an episode's actions below the results folder, by `actions`, and its SHA-256; once.
+
+        Args:
+            index: The episode's number. Of one without actions there is neither.
+        """
+        path, digest = self._written.pop(index, (None, None))
+        return ({} if path is None else {"actions": path}), digest

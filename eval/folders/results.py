@@ -10,6 +10,7 @@ from typing import NotRequired
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.failure_counts import FailureCell, failure_cells
 from arena_newton.eval.plan import rounds
+from arena_newton.eval.records.chain import head
 from arena_newton.eval.records.document import CONFIG_FILE, Document, Identity, Status, check_plan, read_document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, read_journal
 from arena_newton.eval.records.sharding import read_shard
@@ -66,6 +67,8 @@ class Results(Aggregate):
     """Episodes of the plan, or of its part that the folder is of."""
     finished: int
     complete: bool
+    head: NotRequired[str]
+    """Head of the journal's chain (`records.chain`); absent where a line is of a version without chain."""
     shard: NotRequired[str]
     """Part of the plan, such as `3/16`; absent where the folder is of all."""
     failures: NotRequired[list[FailureCell]]
@@ -164,6 +167,9 @@ def results_json(run: RunRecord) -> Results:
     failures = failure_cells(run.records, own_records(run.folder))
     if failures:
         results["failures"] = failures
+    chained = head(run.records)
+    if chained is not None:
+        results["head"] = chained
     if "shard" in run.document:
         results["shard"] = run.document["shard"]
     if run.status is not None:

@@ -21,7 +21,7 @@ from arena_newton.eval.records.document import CONFIG_FILE, Document, read_docum
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
 from arena_newton.eval.records.sharding import Shard
-from arena_newton.files.own_files import PARTIAL
+from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import plain_text
 
@@ -32,6 +32,7 @@ __all__ = [
     "SUBFOLDERS",
     "ResultsFolder",
     "PROCESSOR",
+    "actions_folder",
     "comparable",
     "iso",
     "results_folder",
@@ -89,6 +90,11 @@ def setting(value: object) -> str:
     return "-" if value is None else str(value)
 
 
+def actions_folder(trackers: Sequence[str], tracker: str) -> str:
+    """Folder of the actions of episodes through a tracker, inside a run's: one for each where there are several."""
+    return f"actions/{file_label(tracker)}" if len(trackers) > 1 else "actions"
+
+
 class ResultsFolder:
     """The folder that a run writes."""
 
@@ -125,7 +131,8 @@ class ResultsFolder:
             if others or (half is not None and (half.is_symlink() or not half.is_file())):
                 raise InputError(f"--out {folder}: is not empty and holds no results; choose another folder")
             return None
-        for name in SUBFOLDERS:
+        trackers = self.config.flags.tracker
+        for name in (*SUBFOLDERS, *(actions_folder(trackers, one) for one in trackers)):
             if (folder / name).is_symlink():
                 raise InputError(f"{folder / name}: is a link; a run writes inside its own folder only")
         stored = read_document(folder)
@@ -291,7 +298,7 @@ class ResultsFolder:
 
     def sweep(self) -> None:
         """Remove what unfinished recordings left."""
-        for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial"):
+        for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial", f"actions/*/*{PARTIAL}"):
             for part in self.path.glob(pattern):
                 with contextlib.suppress(OSError):
                     part.unlink()

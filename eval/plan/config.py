@@ -270,6 +270,7 @@ def recording_run(options: RecordOptions) -> RunOptions:
         record_size=options.size,
         record_depth=options.depth,
         record_looks=options.looks,
+        actions=False,  # they are in the recordings
         series=options.seed_series,
         keep=options.episodes if options.only_success else None,
     )
@@ -298,8 +299,6 @@ def resolve(options: RunOptions) -> RunConfig:
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several
-    if options.actions and len(used) > 1:
-        raise InputError("--actions: name the one --tracker through which the actions are recorded")
     checkpoint, checkpoint_hashes = _checkpoint(options, used)
     for tracker in used:
         trackers.check_spec(tracker)
@@ -488,6 +487,8 @@ def _shown(path: Path) -> str:
     inner = path.parent if path.name == "pretrained_model" else path
     if inner.parent.name == "checkpoints":
         return f"{inner.parents[1].name}-{inner.name}"
+    if path.parent.name == "actions":  # of one of several trackers
+        return f"{path.parents[1].name}-{path.name}"
     return path.parent.name if path.name == "actions" and path.parent.name else path.name
 
 

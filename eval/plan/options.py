@@ -256,9 +256,9 @@ class RunOptions(
 
     viewer_failures: bool = False
     """Write a .viser recording of each episode that fails, to walk around in."""
-    actions: bool = False
-    """Write each episode's canonical actions, for --policy replay:<results>/actions through another tracker; of one
-    tracker in a run."""
+    actions: bool = True
+    """Write each episode's canonical actions (about 50 kB), for --policy replay:<results>/actions through another
+    tracker; in a run of several trackers actions/<tracker>."""
     failures: bool = False
     """Keep the signals that tell why an episode failed (docs/failures.md); looks at the head camera twice a second."""
     accept_versions: bool = False

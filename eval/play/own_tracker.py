@@ -24,7 +24,9 @@ def own_options(folder: Path, tracker: str) -> RunOptions:
     """
     stored, where, actions = stored_options(folder), f"--own-tracker {tracker}", folder / "actions"
     if not (stored.failures and stored.actions and actions.is_dir()):
-        raise InputError(f"{where}: {folder} holds no signals or no actions; play it with --failures --actions")
+        raise InputError(f"{where}: {folder} holds no signals or no actions; play it with --failures")
+    if len(stored.tracker) > 1:
+        raise InputError(f"{where}: {folder} was played through {' '.join(stored.tracker)}; name a run through one")
     if stored.shard is not None:
         raise InputError(f"{where}: {folder} is shard {stored.shard} of a run; name the folder of eval merge")
     if tracker in stored.tracker:
@@ -33,4 +35,5 @@ def own_options(folder: Path, tracker: str) -> RunOptions:
         raise InputError(f"{where}: {folder / OWN_FOLDER} is a link; a run writes inside its own folder only")
     groups = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping))
     same = {name: getattr(stored, name) for name in ("task", "seeds", "repeats", *groups)}
-    return RunOptions(**same | {"tracker": (tracker,), "policy": f"replay:{actions}", "out": str(folder / OWN_FOLDER)})
+    played = {"tracker": (tracker,), "policy": f"replay:{actions}", "actions": False, "out": str(folder / OWN_FOLDER)}
+    return RunOptions(**same | played)

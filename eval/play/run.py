@@ -25,7 +25,7 @@ from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.recordings import ActionRecorder
-from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, iso
+from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, actions_folder, iso
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
@@ -316,7 +316,9 @@ class RunPlayer:
                 self.progress.say(console.environment(group, facts))
             recorder = _recorder(config, self.folder.path, tracker)
             recorders: list[Recorder] = [] if recorder is None else [recorder]
-            recorders += [ActionRecorder(self.folder.path / "actions")] if flags.actions else []
+            inside = actions_folder(flags.tracker, tracker)
+            actions = ActionRecorder(self.folder.path, inside) if flags.actions else None
+            recorders += [] if actions is None else [actions]
             if flags.viewer_failures:
                 recorders.append(FailureRecorder(self.folder.path / "failures", _prefix(flags, tracker)))
             signals = SignalRecorder(env) if flags.failures else None
@@ -334,7 +336,8 @@ class RunPlayer:
             def keep(result: EpisodeResult, media: dict[str, str]) -> None:
                 pictures = recorder.media(result.episode) if recorder is not None else {}
                 found = None if signals is None else signals.taken(result.episode.index)
-                self._keep(result, pictures | media, found)
+                files, digest = ({}, None) if actions is None else actions.taken(result.episode.index)
+                self._keep(result, pictures | files | media, found, digest)
                 left.pop(result.episode.index, None)
 
             def on_finish(result: EpisodeResult) -> None:
@@ -394,7 +397,13 @@ class RunPlayer:
             where = {name: path.relative_to(self.folder.path).as_posix() for name, path in saved.files.items()}
             keep(saved.result, where)
 
-    def _keep(self, result: EpisodeResult, media: dict[str, str], signals: EpisodeSignals | None = None) -> None:
+    def _keep(
+        self,
+        result: EpisodeResult,
+        media: dict[str, str],
+        signals: EpisodeSignals | None = None,
+        actions: str | None = None,
+    ) -> None:
         """Append an episode to the journal.
 
         Raises:
@@ -402,7 +411,7 @@ class RunPlayer:
         """
         where, records = self.folder.path, self.journal.records
         check_again(self.config, where, records, result, result.episode, media.values())
-        record = _record(result, media, self.hashes, signals, privileged=self.config.privileged)
+        record = _record(result, media, self.hashes, signals, actions, privileged=self.config.privileged)
         self.journal.append(record)
         self.ended[record.index] = record
 
@@ -442,6 +451,7 @@ def _record(
     media: dict[str, str],
     hashes: dict[str, str | None],
     signals: EpisodeSignals | None = None,
+    actions: str | None = None,
     *,
     privileged: bool = False,
 ) -> EpisodeRecord:
@@ -471,4 +481,5 @@ def _record(
         progress=float(result.progress),
         events=tuple(result.events),
         signals=signals,
+        actions=actions,
     )

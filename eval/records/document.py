@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, TypedDict
 
@@ -25,8 +25,10 @@ __all__ = [
     "SUITE_FILE",
     "Status",
     "check_plan",
+    "plan_faults",
     "plan_numbers",
     "read_document",
+    "step_budgets",
     "trackers_of",
 ]
 
@@ -177,22 +179,32 @@ def trackers_of(config: Identity) -> list[str] | None:
 
 
 def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Document) -> None:
-    """Hold a journal to its configuration.
+    """Hold a journal to its configuration, as `plan_faults` does.
+
+    Raises:
+        InputError: A record belongs to another plan or another run, or contradicts itself.
+    """
+    for fault in plan_faults(folder, records, document):
+        raise fault
+
+
+def plan_faults(folder: Path, records: Iterable[EpisodeRecord], document: Document) -> Iterator[InputError]:
+    """Faults of a journal, held to its configuration.
 
     No episode that the plan lacks or that another run played, none twice under two numbers, and none again that had
     ended as something else than an error; seeds and step budgets are the plan's, and no line contradicts itself.
 
     Raises:
-        InputError: A record belongs to another plan or another run.
+        InputError: The plan is too large, or its shard is not one of it.
     """
     config = document["config"]
     by_hand = "the journal was changed by hand"
     numbers: dict[PlanKey, int] = {}
     ended: dict[int, EpisodeRecord] = {}
-    budgets, plan = _budgets(config), plan_numbers(folder / CONFIG_FILE, config)
+    budgets, plan = step_budgets(config), plan_numbers(folder / CONFIG_FILE, config)
     if plan and document["planned"] != len(plan):
         count = f"planned is {document['planned']}, the plan has {len(plan)}"
-        raise InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
+        yield InputError(f"{folder / CONFIG_FILE}: {count}; it was changed by hand")
     ours = _dealt_numbers(folder / CONFIG_FILE, document, plan)
     run: JsonObject = {key: config[key] for key in _PARTS if key in config}
     named = trackers_of(config)
@@ -209,11 +221,12 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
             or record.repeat >= config["repeats"]
             or ("mode" in config and record.mode not in config["mode"])
         ):
-            raise InputError(f"{name}: is not in the plan of {CONFIG_FILE}; {by_hand}")
+            yield InputError(f"{name}: is not in the plan of {CONFIG_FILE}; {by_hand}")
+            continue
         if ours is not None and record.index not in ours:
-            raise InputError(f"{name}: is not in shard {document['shard']}; {by_hand}")
+            yield InputError(f"{name}: is not in shard {document['shard']}; {by_hand}")
         if numbers.setdefault(key, record.index) != record.index:
-            raise InputError(f"{name}: is in the journal as episode {numbers[key]} too")
+            yield InputError(f"{name}: is in the journal as episode {numbers[key]} too")
         seed = seeding.planned_seed(document["gym_ids"][record.task], kind, record.group_seed, record.repeat)
         planned = run | {"episode_seed": seed, "object_seed": seeding.object_seed(seed), "privileged": privileged}
         if named is not None and record.tracker not in named:
@@ -225,16 +238,16 @@ def check_plan(folder: Path, records: Iterable[EpisodeRecord], document: Documen
         recorded = {field: getattr(record, field) for field in planned} | {"config hash": record.hashes.get("config")}
         for field, wanted in (planned | {"config hash": document["config_hash"]}).items():
             if recorded[field] != wanted:
-                raise InputError(
+                yield InputError(
                     f"{name}: {field} is {shown(recorded[field])}, this run's is {shown(wanted)}; {by_hand}"
                 )
         if record.steps > record.max_steps:
-            raise InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
+            yield InputError(f"{name}: {record.steps} steps of at most {record.max_steps}; {by_hand}")
         before = ended.get(record.index)
         if before is not None and before.outcome != "error" and not _recorded_again(before, record):
-            raise InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
+            yield InputError(f"{name}: is in the journal again after it had ended ({before.outcome}); {by_hand}")
         if (text := contradiction(record)) is not None:
-            raise ContradictionError(f"{name}: {text}; {by_hand}, or wrong when it was written")
+            yield ContradictionError(f"{name}: {text}; {by_hand}, or wrong when it was written")
         ended[record.index] = record
 
 
@@ -244,7 +257,7 @@ def _recorded_again(before: EpisodeRecord, record: EpisodeRecord) -> bool:
     return same and "episode" in (record.media or {})
 
 
-def _budgets(config: Identity) -> dict[str, int]:
+def step_budgets(config: Identity) -> dict[str, int]:
     """Step budgets by task; empty where the run's rule set is not known here."""
     names = config.get("task", [])
     if config["rules"] not in rule_sets.names() or not set(names) <= set(tasks.names()):

@@ -44,6 +44,7 @@ UNHASHED = (
     "data/checks",
     "data/datasets",
     "eval/adapters",
+    "eval/audit",
     "eval/bench",
     "eval/certification",
     "eval/commands",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import errno
 import fcntl
+import hashlib
 import json
 import os
+import re
 import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +24,7 @@ from arena_newton.files.text import counted
 from arena_newton.interfaces import EpisodeEvent
 
 __all__ = [
+    "CHAINED",
     "JOURNAL_FILE",
     "SCHEMA",
     "ContradictionError",
@@ -29,14 +32,18 @@ __all__ = [
     "Journal",
     "LockedLines",
     "StorageError",
+    "chained_line",
     "contradiction",
     "read_journal",
     "write_atomic",
 ]
 
 JOURNAL_FILE = "episodes.jsonl"
-SCHEMA = 2
-"""Newest form of a journal line. 1: without phases, predicates, progress and events, and without this key."""
+SCHEMA = 3
+"""Newest form of a journal line. 1: without phases, predicates, progress and events, and without this key; 2: without
+`previous` and `actions`."""
+CHAINED = 3
+"""First form whose lines are linked."""
 
 OUTCOMES = ("success", "fall", "timeout", "error")
 PlanNumber = Annotated[Count, Fit("a number of the plan")]
@@ -44,6 +51,9 @@ Ticks = Annotated[Count, Fit("a number of ticks")]
 Outcome = Annotated[str, Fit(" ".join(OUTCOMES), lambda value: value in OUTCOMES)]
 Cause = Annotated[str | None, Fit("a name", lambda value: value in (None, "") or is_name(value))]
 
+FileHash = Annotated[
+    str | None, Fit("64 hex digits or null", lambda value: value is None or bool(re.fullmatch("[0-9a-f]{64}", value)))
+]
 Fraction = Annotated[float, Fit("a number from 0 to 1", lambda value: 0 <= value <= 1)]
 
 
@@ -107,6 +117,11 @@ class EpisodeRecord:
     """Single events of the episode, in the order of its ticks."""
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
     """Signals that tell why it failed; None, and absent in the line, without `eval run --failures`."""
+    actions: FileHash = None
+    """SHA-256 of the file of its actions, `media.actions`; None, and absent in the line, where none is kept."""
+    previous: FileHash = None
+    """SHA-256 of the line before in the journal, with its line end; of nothing in the first line. Absent in a line of
+    schema 1 or 2."""
 
     @property
     def shown_policy(self) -> str:
@@ -117,10 +132,11 @@ class EpisodeRecord:
         """The line as a JSON object."""
         values = {key.name: getattr(self, key.name) for key in dataclasses.fields(self)}
         values["events"] = [dataclasses.asdict(event) for event in self.events]
-        signals = values.pop("signals")
-        if not self.privileged:
-            del values["privileged"]
-        return values if signals is None else values | {"signals": dataclasses.asdict(signals)}
+        if self.signals is not None:
+            values["signals"] = dataclasses.asdict(self.signals)
+        absent = {"privileged": not self.privileged}
+        absent |= {name: values[name] is None for name in ("signals", "actions", "previous")}
+        return {key: value for key, value in values.items() if not absent.get(key)}
 
     @classmethod
     def from_json(cls, where: str, line: Mapping[str, Json]) -> EpisodeRecord:
@@ -131,6 +147,17 @@ class EpisodeRecord:
         """
         check_schema(where, line, SCHEMA)
         return loaded(where, line, cls)
+
+
+def chained_line(record: EpisodeRecord, before: bytes) -> tuple[EpisodeRecord, bytes]:
+    """Link a record to the line before it in the journal, which is empty before the first; one of schema 1 or 2 is not.
+
+    Returns:
+        The record with its `previous`, and its line with the line end.
+    """
+    link = hashlib.sha256(before).hexdigest() if record.schema >= CHAINED else None
+    linked = dataclasses.replace(record, previous=link)
+    return linked, json.dumps(linked.to_json(), separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
 class ContradictionError(InputError):
@@ -265,18 +292,23 @@ class Journal(LockedLines):
             StorageError: It cannot be created.
         """
         self.records: list[EpisodeRecord] = []
+        self._last = b""
+        """Last line, its end included."""
         super().__init__(path, self._read)
 
     def _read(self, path: Path) -> int:
         self.records, size = read_journal(path)
+        with path.open("rb") as file:
+            self._last = b"".join(line + b"\n" for line in file.read(size).split(b"\n")[-2:-1])
         return size
 
     def append(self, record: EpisodeRecord) -> None:
-        """Write one record and wait until it is on disk."""
-        line = json.dumps(record.to_json(), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        """Write one record, linked to the last line, and wait until it is on disk."""
+        linked, line = chained_line(record, self._last)
         kept = len({record.index for record in self.records})
         self.append_line(line, f"kept: {counted(kept, 'episode')}")
-        self.records.append(record)
+        self.records.append(linked)
+        self._last = line
 
 
 def write_atomic(path: Path, text: str, kept: str = "the journal is kept") -> None:

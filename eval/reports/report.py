@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from arena_newton.eval.folders.original_format import write_original
+from arena_newton.eval.folders.original_format import ORIGINAL, original_files, write_original
 from arena_newton.eval.folders.results import Results, RunRecord, changed_conditions, results_json, width_rule
 from arena_newton.eval.plan.rounds import LOOK_EVERY
 from arena_newton.eval.records.journal import write_atomic
@@ -17,7 +17,7 @@ from arena_newton.pages.tables import Table, between, escaped, percent
 from arena_newton.robot.g1 import TICK
 from arena_newton.tasks.semantic_mode import semantic_notes
 
-__all__ = ["notes", "table", "write_reports"]
+__all__ = ["derived_files", "notes", "original_of", "table", "write_reports"]
 
 _COLUMNS = """task tracker policy mode episodes successes falls startup_falls timeouts errors
     sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
@@ -119,7 +119,8 @@ def notes(run: RunRecord, results: Results) -> list[str]:
         found.append(f"The policy is queried again after {counted(replan, 'action')} of each chunk.")
     if results["config"].get("ensemble"):
         found.append("At each tick the mean of all chunks that cover it is executed.")
-    return found + changed_conditions(run)
+    found += changed_conditions(run)
+    return found + ([f"Head of the journal: {results['head']}"] if "head" in results else [])
 
 
 def _code(text: object) -> str:
@@ -173,23 +174,32 @@ def _html(run: RunRecord, results: Results) -> str:
 
 
 def write_reports(run: RunRecord) -> Results:
-    """Write results.json, table.md, table.csv, report.md, report.html and original/ into the folder.
+    """Write the derived files of a run into its folder.
 
     Returns:
         The content of results.json.
     """
     results = results_json(run)
-    write_atomic(run.folder / "results.json", json.dumps(results, indent=2) + "\n")
-    write_atomic(run.folder / "table.md", table(results))
-    write_atomic(run.folder / "table.csv", table_csv(results))
-    write_atomic(run.folder / "report.md", _markdown(run, results))
-    write_atomic(run.folder / "report.html", _html(run, results))
-    if "seed_range" not in run.config:  # the original's files are of evaluations
-        write_original(
-            run.folder / "original",
-            run.records,
-            gym_ids=run.document["gym_ids"],
-            seeds=run.config["seeds"],
-            repeats=run.config["repeats"],
-        )
+    for name, text in derived_files(run, results).items():
+        write_atomic(run.folder / name, text)
+    write_original(run.folder / ORIGINAL, original_of(run))
     return results
+
+
+def derived_files(run: RunRecord, results: Results) -> dict[str, str]:
+    """Texts of results.json, table.md, table.csv, report.md and report.html, by name."""
+    return {
+        "results.json": json.dumps(results, indent=2) + "\n",
+        "table.md": table(results) + (f"\nHead of the journal: {results['head']}\n" if "head" in results else ""),
+        "table.csv": table_csv(results),
+        "report.md": _markdown(run, results),
+        "report.html": _html(run, results),
+    }
+
+
+def original_of(run: RunRecord) -> dict[str, str]:
+    """Texts of the original's files of a run, by path below `original/`; none of demonstrations."""
+    if "seed_range" in run.config:
+        return {}
+    config = run.config
+    return original_files(run.records, run.document["gym_ids"], config["seeds"], config["repeats"])

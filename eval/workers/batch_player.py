@@ -104,7 +104,7 @@ def _check_shared(path: Path) -> None:
         if time.monotonic() > until:
             raise InputError(
                 f"{os.uname().nodename}: {path} is not there; episodes write files into the results folder, which must "
-                "be on a disk that all nodes share"
+                "be on a disk that all nodes share; without one write no files (--no-actions)"
             )
         time.sleep(0.2)
 

@@ -18,9 +18,10 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.folders.run_folder import RECORDING_FLAGS, comparable, setting
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records.chain import outcome_of
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
-from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, write_atomic
+from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, chained_line, write_atomic
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
@@ -29,13 +30,10 @@ from arena_newton.files.text import counted, plain_text
 
 __all__ = ["MergedRun", "merge"]
 
-TIMES = ("started_at", "finished_at")
-"""Keys of a journal line that differ when an episode is played again, as `durations.wall_s` does."""
-PICTURES = ("media", "video")
-"""Keys that say what was recorded of an episode: not what came of it."""
 _NAMED = 20
 """Shards, episodes or files that a message names."""
-_MEDIA = re.compile(r"(?:videos|strips|episodes(?:/videos)?)/[A-Za-z0-9_][A-Za-z0-9._-]*")
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9._-]*"
+_MEDIA = re.compile(rf"(?:videos|strips|actions(?:/{_NAME})?|episodes(?:/videos)?)/{_NAME}")
 """Paths of recordings, as runs write them."""
 _BLOCK = 1 << 20
 
@@ -110,8 +108,7 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
         lost = [name for part in kept for name in _copied(part, runs[0].document["options"], temporary)]
         if lost:
             notes.append(f"Recordings that the journals name and no folder has: {_listed(lost)}.")
-        lines = (json.dumps(part.record.to_json(), separators=(",", ":"), allow_nan=False) for part in kept)
-        write_atomic(temporary / JOURNAL_FILE, "".join(f"{line}\n" for line in lines))
+        write_atomic(temporary / JOURNAL_FILE, _chained([part.record for part in kept]))
         write_atomic(temporary / CONFIG_FILE, json.dumps(document, indent=2) + "\n")
         results = report.write_reports(load_run(temporary))
         try:
@@ -229,8 +226,7 @@ def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
 
 
 def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
-    first, second = (_outcome(one) for one in (known.record, record))
-    difference = differing_key(first, second)
+    difference = differing_key(*map(outcome_of, (known.record, record)), ignored=("actions",))
     if difference is None:
         return
     key, was, now = difference
@@ -241,14 +237,12 @@ def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
     )
 
 
-def _outcome(record: EpisodeRecord) -> JsonObject:
-    """Outcome of an episode, without times of day, recordings and the libraries' versions."""
-    line = record.to_json()
-    for key in (*TIMES, *PICTURES):
-        del line[key]
-    line["durations"] = {key: value for key, value in (record.durations or {}).items() if key != "wall_s"}
-    line["hashes"] = {key: value for key, value in line.pop("hashes").items() if key != "versions"}
-    return line
+def _chained(records: Sequence[EpisodeRecord]) -> str:
+    """Text of a journal of these lines."""
+    lines = [b""]
+    for record in records:
+        lines.append(chained_line(record, lines[-1])[1])
+    return b"".join(lines).decode()
 
 
 def _missing(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> str:
@@ -321,7 +315,8 @@ def _files(part: _Kept, options: Mapping[str, Json]) -> Iterator[tuple[str, bool
             where = f"{part.folder / JOURNAL_FILE}: episode {record.index}"
             raise InputError(f"{where}: {plain_text(name, 60)} is {shown(path)}, expected a recording of the folder")
         yield path, True
-    yield f"actions/{record.task}_{record.mode}_s{record.group_seed}_r{record.repeat}.npz", False
+    if record.actions is None:  # of a version that did not name the file
+        yield f"actions/{record.task}_{record.mode}_s{record.group_seed}_r{record.repeat}.npz", False
     label = f"{record.task}__{record.mode}__seed{record.group_seed}__repeat{record.repeat}.viser"
     trackers = options.get("tracker")
     several = isinstance(trackers, list) and len(trackers) > 1

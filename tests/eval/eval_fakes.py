@@ -81,7 +81,10 @@ class FakeEnv:
         far, kind = self.seeds[world] % 997 / 997, self.seeds[world] % 10
         ended = self.tick[world] > self.seeds[world] % SLOW
         fell = (EpisodeEvent("fall", int(self.tick[world])),) if ended and 5 <= kind < 8 else ()
-        return Verdict(margin=far if ended and kind < 5 else -far, events=fell)
+        won = ended and kind < 5
+        names = [predicate.name for predicate in self.spec.predicates]
+        held = dict.fromkeys(names, int(self.tick[world]) if won else None)
+        return Verdict(margin=far if won else -far, events=fell, predicates=held, progress=float(won))
 
     def describe(self):
         return {"engine": self.options["engine"], "device": "cpu", "physics_dt": 0.001, "startup_ticks": 0}

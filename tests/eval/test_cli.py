@@ -150,7 +150,6 @@ def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
         (["--checkpoint", "absent.onnx"], "--checkpoint absent.onnx: no such file"),
         (["--checkpoint", "absent.onnx", "--tracker", "twist2", "sonic"], "--checkpoint absent.onnx: name the one"),
         (["--tracker", "pd", "pd"], "--tracker pd: given twice"),
-        (["--tracker", "pd", "twist2", "--actions"], "--actions: name the one --tracker"),
         (["--policy", "replay:absent.npz"], "--policy replay:absent.npz: no such file"),
         (["--variant", "absent.usda"], "--variant absent.usda: no such file"),
         (["--repeats", "0"], "--repeats 0"),

@@ -267,7 +267,7 @@ def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
     (tmp_path / "b" / "config.json").write_text(json.dumps(kept_none))
     for name, tracker, said in (
         ("a", "sonic", "was played through it"),
-        ("b", "twist2", "holds no signals or no actions; play it with --failures --actions"),
+        ("b", "twist2", "holds no signals or no actions; play it with --failures"),
     ):
         assert main(["report", str(tmp_path / name), "--own-tracker", tracker]) == 2
         error = capsys.readouterr().err

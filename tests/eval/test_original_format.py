@@ -7,7 +7,7 @@ import pytest
 from rows import episodes, made
 
 from arena_newton.errors import InputError
-from arena_newton.eval.folders.original_format import SUMMARY_COLUMNS, final_csv, write_original
+from arena_newton.eval.folders.original_format import SUMMARY_COLUMNS, final_csv, original_files, write_original
 from arena_newton.files.own_files import file_label
 
 GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
@@ -15,7 +15,7 @@ GYM = {"football": "Isaac-Move-Football-Single-G129-Dex3-Wholebody"}
 
 def written(tmp_path, rows):
     """Write and return the run's folder."""
-    write_original(tmp_path, [made(row) for row in rows], gym_ids=GYM, seeds=(0, 1, 2), repeats=20)
+    write_original(tmp_path, original_files([made(row) for row in rows], GYM, (0, 1, 2), 20))
     return tmp_path / "football__t__base"
 
 
@@ -64,7 +64,7 @@ def test_nothing_is_written_outside(tmp_path, key, value):
     folder = tmp_path / "a" / "original"
     rows = [made(row | {key: value}) for row in episodes("football", (1, 0, 0))]
     with pytest.raises(InputError, match="lies outside"):
-        write_original(folder, rows, gym_ids={"football": "G", value: "G"}, seeds=(0, 1, 2), repeats=20)
+        write_original(folder, original_files(rows, {"football": "G", value: "G"}, (0, 1, 2), 20))
     assert list(tmp_path.iterdir()) == []
 
 

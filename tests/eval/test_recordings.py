@@ -130,13 +130,13 @@ def test_recordings_follow_no_link(tmp_path):
     folder.mkdir()
     for name in ("boxing_base_s0_r0.npz", f"boxing_base_s0_r0.npz{PARTIAL}"):
         (folder / name).symlink_to(victim)
-    recorder = ActionRecorder(folder)
+    recorder = ActionRecorder(folder.parent, folder.name)
     env = SimpleNamespace(active=np.array([True, True]), tick=np.array([-1, 0]), spec=SimpleNamespace(gym_id="gym"))
     for world in (0, 1):
         recorder.start(env, world, None)
     for _ in range(3):
         recorder.before_physics(env, None, torch.ones(2, 40))
-    episode = SimpleNamespace(episode_seed=7, key="boxing/base/s0/r0", mode="base")
+    episode = SimpleNamespace(index=0, episode_seed=7, key="boxing/base/s0/r0", mode="base")
     recorder.finish(env, 0, SimpleNamespace(episode=episode, steps=0))  # it never acted
     recorder.finish(env, 1, SimpleNamespace(episode=episode, steps=3))
     (path,) = folder.iterdir()

@@ -22,7 +22,7 @@ from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 JOURNALS = Path(__file__).parent / "journals"
 NEW_KEYS = ("schema", "phases", "predicates", "progress", "events")
-RAN = {1: ("stand", 20), 2: ("expert", 150)}
+RAN = {1: ("stand", 20), 2: ("expert", 150), 3: ("expert", 150)}
 """Schema → policy and steps of its run."""
 
 
@@ -44,13 +44,14 @@ def test_journals_of_every_schema_are_reported(tmp_path, capsys, schema):
     assert lines == [(schema, "boxing", policy, "timeout", steps)] * 2
     assert (run.status is None) == (schema == 1)
     reached = [(r.phases, r.predicates) for r in run.records]
-    if schema > 1:
+    if schema == 2:
         phases = (("approach", 0),)
         nothing, near = {"approach": None, "contact": None}, {"approach": 128, "contact": None}
         assert reached == [(phases, nothing), (phases, near)]
     assert main(["report", str(folder)]) == 0
-    assert f"| boxing | twist2  | {policy:<6} | base | 2 |" in capsys.readouterr().out
+    assert f"| boxing | twist2  | {run.records[0].shown_policy:<6} | base | 2 |" in capsys.readouterr().out
     assert {"report.html", "table.csv", "results.json", "original"} <= {path.name for path in folder.iterdir()}
+    assert ("head" in json.loads((folder / "results.json").read_text())) == (schema > 2)
 
 
 @pytest.mark.parametrize("schema", range(1, SCHEMA + 1))
@@ -72,7 +73,7 @@ def test_a_journal_from_the_future_is_refused(tmp_path, capsys):
         assert main([command, str(folder)]) == 2
         error = capsys.readouterr().err
         if command == "report":
-            assert error.count("\n") == 1 and "line 1: schema 3 was written by a newer version" in error
+            assert error.count("\n") == 1 and f"line 1: schema {SCHEMA + 1} was written by a newer version" in error
 
 
 def test_a_line_says_what_the_result_holds(tmp_path):
@@ -87,7 +88,8 @@ def test_a_line_says_what_the_result_holds(tmp_path):
     text = (tmp_path / "episodes.jsonl").read_text()
     assert '"phases":[["walk",0],["strike",31]],"predicates":{"approach":30,"contact":null},"progress":0.5' in text
     assert '"events":[{"kind":"contact","tick":12,"detail":"left_palm"},' in text
-    assert read_journal(tmp_path / "episodes.jsonl")[0] == [line]
+    (found,) = read_journal(tmp_path / "episodes.jsonl")[0]
+    assert dataclasses.replace(found, previous=None) == line
     assert (line.schema, line.margin, line.video) == (SCHEMA, None, "videos/a.mp4")
 
 

@@ -86,7 +86,6 @@ def plan_of(context: Context) -> RunOptions:
         engine="mujoco",
         device=context.options.device,
         worlds=min(context.options.worlds, EPISODES),
-        actions=len(context.sample) == 1,  # a run writes those of one tracker
         out=str(context.folder / "runs" / "plan" / "alone"),
     )
 
@@ -215,7 +214,7 @@ def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:
     flags = ["run", "--task", *plan.task, "--tracker", *plan.tracker, "--policy", plan.policy, "--mode", *plan.mode]
     flags += ["--seeds", *map(str, plan.seeds), "--repeats", str(plan.repeats), "--engine", plan.engine]
     flags += ["--device", plan.device] if plan.device is not None else []
-    flags += ["--actions"] * plan.actions + ["--worlds", str(RAY_WORLDS), "--out", str(folder)]
+    flags += ["--worlds", str(RAY_WORLDS), "--out", str(folder)]
     flags += ["--ray", "--ray-cpus", "1", "--ray-actors", str(ACTORS)]
     folder.parent.mkdir(parents=True, exist_ok=True)
     log, code = folder.with_suffix(".log"), None

@@ -12,7 +12,7 @@ from arena_newton.eval.records.journal import JOURNAL_FILE
 
 __all__ = ["contents", "digest"]
 
-TIMES = re.compile(rb'"(wall_s|started_at|finished_at|duration_sec)": ?("[^"]*"|[0-9.e+-]+)')
+TIMES = re.compile(rb'"(wall_s|started_at|finished_at|duration_sec|previous)": ?("[^"]*"|[0-9.e+-]+)')
 """Values of a journal line, or of an episode's file, that differ when an episode is played again."""
 TIMED = (JOURNAL_FILE, "original/*/episodes/*.json")
 """Files in which these are."""

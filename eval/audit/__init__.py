@@ -1,0 +1,1 @@
+"""Audit of results folders: how far each was checked, from its own lines to episodes that are played again."""

@@ -1,0 +1,214 @@
+"""Audit of one results folder: chain, lines, derived files, and the level to which it was checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.eval.audit.line_checks import action_faults, configuration_faults, is_current, line_faults
+from arena_newton.eval.folders.original_format import ORIGINAL
+from arena_newton.eval.folders.results import Results, RunRecord, in_plan_order, results_json
+from arena_newton.eval.records.chain import broken_links
+from arena_newton.eval.records.document import CONFIG_FILE, plan_faults, read_document, step_budgets
+from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, read_journal, write_atomic
+from arena_newton.eval.reports import report
+from arena_newton.files.stored_json import JsonObject, parse, read_regular
+from arena_newton.files.text import counted, plain_text
+from arena_newton.pages.tables import Table, escaped
+
+__all__ = ["Audit", "Level", "audited", "runs_in", "write_pages"]
+
+MAX_DERIVED_BYTES = 512 << 20
+MOST_FAULTS = 1000
+"""Contradictions that an audit lists; a forged folder may have many times as many."""
+
+
+class Level(StrEnum):
+    """Level to which a result was checked, from low to high."""
+
+    SELF_REPORTED = "self-reported"
+    """The numbers are the owner's; nothing was checked, or something contradicts."""
+    CONSISTENT = "consistent"
+    """Lines, plan, rules, chain and derived files agree."""
+    REPLAYED = "replayed"
+    """Episodes were played again from their actions, and ended as recorded."""
+    RERUN = "re-run"
+    """The policy was asked again. No audit does that yet."""
+
+
+MEANINGS = {
+    Level.SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
+    Level.CONSISTENT: "lines, plan, rules, links and derived files agree",
+    Level.REPLAYED: "episodes were played again from their actions, and ended as recorded",
+    Level.RERUN: "the policy was asked again; no audit does that yet",
+}
+
+
+@dataclass
+class Audit:
+    """Findings of an audit."""
+
+    run: RunRecord
+    results: Results
+    faults: list[str] = field(default_factory=list)
+    """Contradictions, a sentence each."""
+    notes: list[str] = field(default_factory=list)
+    """Remarks: what could not be checked, and why."""
+    lacking: list[int] = field(default_factory=list)
+    """Numbers of the episodes whose actions are not there."""
+    replayed: int | None = None
+    """Episodes that were played again; None: that was not asked for."""
+
+    @property
+    def level(self) -> Level:
+        """Highest level without a contradiction."""
+        if self.faults:
+            return Level.SELF_REPORTED
+        return Level.REPLAYED if self.replayed else Level.CONSISTENT
+
+    @property
+    def head(self) -> str:
+        """Head of the chain, or `unchained`."""
+        return self.results.get("head", "unchained")
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Facts of the audit by name."""
+        episodes = f"{self.results['finished']} of {self.results['planned']}"
+        replayed = "none" if self.replayed is None else f"{self.replayed} of {self.results['finished']}"
+        found = [("level", self.level.value), ("head", self.head), ("episodes", episodes), ("replayed", replayed)]
+        return [*found, ("contradictions", str(len(self.faults))), ("configuration", self.results["config_hash"])]
+
+    def to_json(self) -> JsonObject:
+        """Content of audit.json."""
+        return dict(self.facts()) | {
+            "levels": dict(MEANINGS),
+            "contradictions": self.faults,
+            "notes": self.notes,
+            "replayed": self.replayed,
+        }
+
+
+def audited(folder: Path, published: str | None = None) -> Audit:
+    """Check a results folder without the simulator.
+
+    Args:
+        folder: The folder; nothing in it is written.
+        published: Head that was published with its numbers, if one was.
+
+    Raises:
+        InputError: It holds no run, or journal or configuration cannot be read as one.
+    """
+    document = read_document(folder)
+    records, _ = read_journal(folder / JOURNAL_FILE)
+    seeds, known = document["config"]["seeds"], document["gym_ids"]
+    planned = [record for record in records if record.task in known and record.group_seed in seeds]
+    run = RunRecord(folder, document, in_plan_order(planned))
+    found = Audit(run, results_json(run))
+    for fault in _faults(run, records, found, published):
+        found.faults.append(plain_text(fault, 2000))
+        if len(found.faults) == MOST_FAULTS:
+            found.notes.append(f"The audit stopped after {counted(MOST_FAULTS, 'contradiction')}.")
+            break
+    if "head" not in found.results:
+        found.notes.append("Unchained: a line was written by a version without chain, or there is none.")
+    if not step_budgets(run.config):
+        found.notes.append(
+            "The rules are of another version: step budgets, predicates and rule texts were not checked."
+        )
+    if found.lacking:
+        found.notes.append(f"{counted(len(found.lacking), 'episode')} cannot be replayed: the actions are not there.")
+    if not found.results["complete"]:
+        found.notes.append(f"Incomplete: {found.results['finished']} of {found.results['planned']} episodes.")
+    return found
+
+
+def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit, published: str | None) -> Iterator[str]:
+    """All contradictions, in the order of a reader: configuration, lines, chain, actions, tables."""
+    yield from configuration_faults(run)
+    yield from map(str, plan_faults(run.folder, records, run.document))
+    yield from line_faults(run, records)
+    yield from broken_links(run.folder / JOURNAL_FILE, records)
+    if published is not None and found.head != published:
+        yield f"{run.folder / JOURNAL_FILE}: head is {found.head}, published was {published}"
+    yield from action_faults(run, run.records, found.lacking)
+    yield from _derived_faults(run, found)
+
+
+def _derived_faults(run: RunRecord, found: Audit) -> Iterator[str]:
+    """Derived files that are not what journal and configuration give."""
+    here = is_current(run)
+    wanted = report.derived_files(run, found.results)
+    wanted |= {f"{ORIGINAL}/{name}": text for name, text in report.original_of(run).items()}
+    missing = []
+    for name, text in wanted.items():
+        path = run.folder / name
+        again = "is not what journal and configuration give; `eval report` writes it again"
+        try:
+            data = read_regular(path, MAX_DERIVED_BYTES)
+        except FileNotFoundError:
+            missing.append(name)
+            continue
+        if here and data != text.encode():
+            yield f"{path}: {again}"
+        elif not here and name == "results.json" and not _same_figures(data, found.results):
+            yield f"{path}: its cells or suites are not those of the journal"
+    extra = {path.relative_to(run.folder).as_posix() for path in (run.folder / ORIGINAL).rglob("*") if path.is_file()}
+    for name in sorted(extra - set(wanted)):
+        yield f"{run.folder / name}: is of no episode of the journal"
+    if missing:
+        found.notes.append(f"{counted(len(missing), 'derived file')} not there, such as {missing[0]}.")
+    if not here:
+        found.notes.append("Written by another version: of the tables the figures alone were compared.")
+
+
+def _same_figures(data: bytes, results: Results) -> bool:
+    """True if a results.json of any version has these cells and suites."""
+    try:
+        stored = parse(data)
+    except ValueError:
+        return False
+    ours: JsonObject = json.loads(json.dumps({"cells": results["cells"], "suites": results["suites"]}))
+    if not isinstance(stored, dict):
+        return False
+    for kind, rows in ours.items():
+        given = stored.get(kind)
+        if not isinstance(given, list) or len(given) != len(rows):
+            return False
+        for one, row in zip(given, rows, strict=True):
+            if not isinstance(one, dict) or any(one[key] != row[key] for key in one if key in row):
+                return False
+    return True
+
+
+def write_pages(audits: list[Audit], out: Path) -> None:
+    """Write audit.json and audit.md of one or several audits into a folder.
+
+    Raises:
+        StorageError: A file cannot be written.
+    """
+    content = {str(one.run.folder): one.to_json() for one in audits}
+    write_atomic(out / "audit.json", json.dumps(content, indent=2) + "\n")
+    lines = ["# Audit", ""]
+    for one in audits:
+        lines += [f"## {escaped(str(one.run.folder))}: {one.level}", ""]
+        lines += [*Table(("", ""), one.facts(), "ll").compact(escaped, ("---", "---")), ""]
+        lines += [f"- contradiction: {escaped(fault)}" for fault in one.faults]
+        lines += [f"- {escaped(note)}" for note in one.notes] + [""]
+    lines += ["## Levels", "", *(f"- {level}: {text}" for level, text in MEANINGS.items())]
+    write_atomic(out / "audit.md", "\n".join(lines) + "\n")
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """A results folder itself, or all in a folder of several, such as a suite.
+
+    Raises:
+        InputError: There is none.
+    """
+    found = [folder] if (folder / CONFIG_FILE).is_file() else sorted(p.parent for p in folder.rglob(CONFIG_FILE))
+    if not found:
+        raise InputError(f"{folder}: no results folder (it has no {CONFIG_FILE})")
+    return found
