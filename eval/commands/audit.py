@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
 
 __all__ = ["AuditOptions", "run"]
 
@@ -21,11 +25,17 @@ class AuditOptions:
 
     head: str | None = None
     """Head that was published with the numbers of the one folder; the journal must have it."""
+    replay: int = 0
+    """Play so many episodes again on engine mujoco, from their actions alone: they must end as recorded, to the bit."""
+    draw: int = 0
+    """Number of your own by which, with the head, they are drawn."""
+    all: bool = False
+    """Play all episodes again."""
     out: str | None = None
     """Folder for audit.json and audit.md; without it they are printed alone."""
 
 
-def run(folders: Sequence[Path], options: AuditOptions) -> int:
+def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | None = None) -> int:
     """Audit, print, and write the pages.
 
     Returns:
@@ -37,11 +47,17 @@ def run(folders: Sequence[Path], options: AuditOptions) -> int:
     from arena_newton.eval.audit.folder_audit import audited, runs_in, write_pages
 
     named = [inside for folder in folders for inside in runs_in(folder)]
+    if options.replay < 0:
+        raise InputError(f"--replay {options.replay}: expected a number of episodes")
     if options.head is not None and len(named) > 1:
         raise InputError("--head: is of one folder")
     audits = []
     for folder in named:
         one = audited(folder, options.head)
+        if options.replay or options.all:
+            from arena_newton.eval.audit.replay import drawn, replay
+
+            replay(one, drawn(one, None if options.all else options.replay, options.draw), factories)
         audits.append(one)
         print(f"{folder}: {', '.join(f'{name} {value}' for name, value in one.facts())}")
         for fault in one.faults:

@@ -1,6 +1,8 @@
 """`run --actions` keeps what a policy decided; `replay:` plays each episode's own recording."""
 
+import hashlib
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -64,6 +66,24 @@ def test_replay_through_the_same_tracker_is_the_same_run(recorded, tmp_path, pla
     replay = ["--policy", f"replay:{recorded / 'actions'}"]
     assert play(*RUN[:-1], "1", *replay, "--out", str(out)) == 0
     assert ends(out) == ends(recorded)
+
+
+def test_an_audit_plays_what_the_journal_says(recorded, tmp_path, kept_worlds, capsys):
+    """A replay from actions alone confirms an honest line to the last bit, and finds one that agrees with itself."""
+    made = Factories(env=kept_worlds)
+    assert main(["audit", str(recorded), "--replay", "1", "--draw", "7"], made) == 0
+    assert "level replayed" in capsys.readouterr().out
+    forged = shutil.copytree(recorded, tmp_path / "forged")
+    first, second = journal(forged)
+    first["margin"] += 1e-9
+    line = json.dumps(first, separators=(",", ":")).encode() + b"\n"
+    second["previous"] = hashlib.sha256(line).hexdigest()
+    (forged / "episodes.jsonl").write_bytes(line + json.dumps(second, separators=(",", ":")).encode() + b"\n")
+    assert main(["report", str(forged)]) == 0 and main(["audit", str(forged)]) == 0
+    assert main(["audit", str(forged), "--all", "--out", str(tmp_path)], made) == 1
+    content = json.loads((tmp_path / "audit.json").read_text())[str(forged)]
+    (found,) = content["contradictions"]
+    assert f"episode {first['index']}: margin is " in found and content["level"] == "self-reported"
 
 
 def test_another_tracker_gets_the_same_actions(recorded, tmp_path, play):
