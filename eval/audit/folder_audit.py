@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 
 from arena_newton.errors import InputError
@@ -20,32 +19,21 @@ from arena_newton.files.stored_json import JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["Audit", "Level", "audited", "runs_in", "write_pages"]
+__all__ = ["LEVELS", "Audit", "audited", "runs_in", "write_pages"]
 
 MAX_DERIVED_BYTES = 512 << 20
 MOST_FAULTS = 1000
 """Contradictions that an audit lists; a forged folder may have many times as many."""
 
 
-class Level(StrEnum):
-    """Level to which a result was checked, from low to high."""
-
-    SELF_REPORTED = "self-reported"
-    """The numbers are the owner's; nothing was checked, or something contradicts."""
-    CONSISTENT = "consistent"
-    """Lines, plan, rules, chain and derived files agree."""
-    REPLAYED = "replayed"
-    """Episodes were played again from their actions, and ended as recorded."""
-    RERUN = "re-run"
-    """The policy was asked again. No audit does that yet."""
-
-
-MEANINGS = {
-    Level.SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
-    Level.CONSISTENT: "lines, plan, rules, links and derived files agree",
-    Level.REPLAYED: "episodes were played again from their actions, and ended as recorded",
-    Level.RERUN: "the policy was asked again; no audit does that yet",
+SELF_REPORTED, CONSISTENT, REPLAYED, RERUN = "self-reported", "consistent", "replayed", "re-run"
+LEVELS = {
+    SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
+    CONSISTENT: "lines, plan, rules, links and derived files agree",
+    REPLAYED: "episodes were played again from their actions, and ended as recorded",
+    RERUN: "the policy was asked again; no audit does that yet",
 }
+"""Level to which a result was checked, from low to high → what is known then."""
 
 
 @dataclass
@@ -64,11 +52,11 @@ class Audit:
     """Episodes that were played again; None: that was not asked for."""
 
     @property
-    def level(self) -> Level:
+    def level(self) -> str:
         """Highest level without a contradiction."""
         if self.faults:
-            return Level.SELF_REPORTED
-        return Level.REPLAYED if self.replayed else Level.CONSISTENT
+            return SELF_REPORTED
+        return REPLAYED if self.replayed else CONSISTENT
 
     @property
     def head(self) -> str:
@@ -79,13 +67,13 @@ class Audit:
         """Facts of the audit by name."""
         episodes = f"{self.results['finished']} of {self.results['planned']}"
         replayed = "none" if self.replayed is None else f"{self.replayed} of {self.results['finished']}"
-        found = [("level", self.level.value), ("head", self.head), ("episodes", episodes), ("replayed", replayed)]
+        found = [("level", self.level), ("head", self.head), ("episodes", episodes), ("replayed", replayed)]
         return [*found, ("contradictions", str(len(self.faults))), ("configuration", self.results["config_hash"])]
 
     def to_json(self) -> JsonObject:
         """Content of audit.json."""
         return dict(self.facts()) | {
-            "levels": dict(MEANINGS),
+            "levels": LEVELS,
             "contradictions": self.faults,
             "notes": self.notes,
             "replayed": self.replayed,
@@ -198,7 +186,7 @@ def write_pages(audits: list[Audit], out: Path) -> None:
         lines += [*Table(("", ""), one.facts(), "ll").compact(escaped, ("---", "---")), ""]
         lines += [f"- contradiction: {escaped(fault)}" for fault in one.faults]
         lines += [f"- {escaped(note)}" for note in one.notes] + [""]
-    lines += ["## Levels", "", *(f"- {level}: {text}" for level, text in MEANINGS.items())]
+    lines += ["## Levels", "", *(f"- {level}: {text}" for level, text in LEVELS.items())]
     write_atomic(out / "audit.md", "\n".join(lines) + "\n")
 
 

@@ -45,6 +45,8 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         InputError: A folder holds no run, or cannot be read as one.
     """
     from arena_newton.eval.audit.folder_audit import audited, runs_in, write_pages
+    from arena_newton.eval.records.chain import joint_head
+    from arena_newton.files.text import counted
 
     named = [inside for folder in folders for inside in runs_in(folder)]
     if options.replay < 0:
@@ -64,6 +66,9 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
             print(f"  contradiction: {fault}")
         for note in one.notes:
             print(f"  {note}")
+    joint = joint_head([one.results.get("head") for one in audits])
+    if len(audits) > 1 and joint is not None:
+        print(f"Head of {counted(len(audits), 'journal')}: {joint}.")
     if options.out is not None:
         out = Path(options.out).expanduser()
         write_pages(audits, out)

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from arena_newton.eval.records.journal import CHAINED, EpisodeRecord
 from arena_newton.eval.records.schema import MAX_JOURNAL_BYTES
 from arena_newton.files.stored_json import JsonObject, read_regular
 
-__all__ = ["broken_links", "head", "outcome_of"]
+__all__ = ["broken_links", "head", "joint_head", "outcome_of"]
 
 TIMES = ("started_at", "finished_at")
 """Keys of a journal line that differ when an episode is played again, as `durations.wall_s` does."""
@@ -53,6 +53,21 @@ def head(records: Iterable[EpisodeRecord]) -> str | None:
         line = json.dumps(outcome_of(record), sort_keys=True, separators=(",", ":"))
         digest = hashlib.sha256((digest + line).encode()).hexdigest()
     return digest or None
+
+
+def joint_head(heads: Collection[str | None]) -> str | None:
+    """Head of several runs, the same in whatever order they are given: SHA-256 of their sorted heads.
+
+    Args:
+        heads: Of each run; of a single one it is the joint head itself.
+
+    Returns:
+        64 hex digits; None where a run has none.
+    """
+    known = sorted(filter(None, heads))
+    if not known or len(known) < len(heads):
+        return None
+    return known[0] if len(known) == 1 else hashlib.sha256("".join(known).encode()).hexdigest()
 
 
 def broken_links(path: Path, records: Iterable[EpisodeRecord]) -> Iterator[str]:

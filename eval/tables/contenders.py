@@ -12,7 +12,7 @@ from arena_newton.eval.folders.results import RunRecord, changed_conditions, is_
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.statistics.comparison import Contender
 from arena_newton.eval.suites.suite_records import SuiteCell
-from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, read_folder, runs_of
+from arena_newton.eval.tables.episode_table import PlayedCell, code_notes, error_note, head_notes, read_folder, runs_of
 from arena_newton.files.stored_json import Json, shown
 from arena_newton.files.text import counted, plain_text
 from arena_newton.tasks.semantic_mode import semantic_notes
@@ -282,7 +282,7 @@ def _notes(gathered: Sequence[Compared], differ: Sequence[str]) -> list[str]:
         if (now := record.hashes.get("checkpoint")) is not None:
             weights.setdefault(record.tracker, {})[now] = None
     found += [f"Weights of {tracker} differ: {' '.join(kept)}." for tracker, kept in weights.items() if len(kept) > 1]
-    found += code_notes(runs)
+    found += code_notes(runs) + head_notes(runs)
     found += [
         f"{what} have changed between the runs: {' '.join(sorted(versions))}, of the same tasks."
         for key, what in HASHED.items()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, check_whole_plan, is_complete, load_run
+from arena_newton.eval.records.chain import head, joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.suites.suite_records import SuiteCell, SuitePlan, load_cell, read_suite
@@ -27,6 +28,7 @@ __all__ = [
     "check_alike",
     "code_notes",
     "error_note",
+    "head_notes",
     "incomplete_note",
     "read_folder",
     "runs_of",
@@ -258,6 +260,12 @@ def check_alike(runs: Sequence[RunRecord]) -> dict[str, str]:
                 name = f"weights of {plain(record.tracker)}"
                 raise InputError(f"{run.folder}: {name} are {plain(now)}, in {first[1]} {plain(first[0])}")
     return {tracker: now for tracker, (now, _) in weights.items()}
+
+
+def head_notes(runs: Sequence[RunRecord]) -> list[str]:
+    """A sentence with the head of the journals, which binds the table to their episodes; none where one has no head."""
+    found = joint_head([head(run.records) for run in runs])
+    return [] if found is None else [f"Head of {counted(len(runs), 'journal')}: {found}."]
 
 
 def code_notes(runs: Iterable[RunRecord]) -> list[str]:

@@ -20,6 +20,7 @@ from arena_newton.eval.tables.episode_table import (
     check_alike,
     code_notes,
     error_note,
+    head_notes,
     read_folder,
     runs_of,
 )
@@ -169,7 +170,7 @@ def _conditions(cells: Sequence[PlayedCell]) -> list[str]:
         values = sorted({shown(run.config.get(name)) for run in runs if name in run.config})
         if len(values) > 1:
             found.append(f"{name.replace('_', ' ').capitalize()}: {' and '.join(values)}.")
-    found += [*code_notes(runs), *filter(None, [error_note(cells)])]
+    found += [*code_notes(runs), *filter(None, [error_note(cells)]), *head_notes(runs)]
     episodes = sum(len(cell.records) for cell in cells)
     return [*found, f"{counted(episodes, 'episode')} in {counted(len(cells), 'cell')}."]
 

@@ -16,6 +16,7 @@ from arena_newton.eval.tables.episode_table import (
     check_alike,
     code_notes,
     error_note,
+    head_notes,
     incomplete_note,
 )
 from arena_newton.eval.tables.table_entries import ordered
@@ -113,4 +114,4 @@ def _notes(runs: Sequence[RunRecord], cells: Sequence[EvaluatedCell]) -> list[st
     found += semantic_notes(cell.mode for cell in cells)
     falls = [held for cell in cells for held in cell.held("fall").values()]
     found += [f"{counted(sum(falls), 'episode')} of {len(falls)} ended in a fall."] if any(falls) else []
-    return [*found, *filter(None, [error_note(cells)]), *code_notes(runs)]
+    return [*found, *filter(None, [error_note(cells)]), *code_notes(runs), *head_notes(runs)]

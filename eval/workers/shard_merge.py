@@ -226,7 +226,7 @@ def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
 
 
 def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
-    difference = differing_key(*map(outcome_of, (known.record, record)), ignored=("actions",))
+    difference = differing_key(outcome_of(known.record), outcome_of(record), ignored=("actions",))
     if difference is None:
         return
     key, was, now = difference

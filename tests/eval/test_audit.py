@@ -71,6 +71,10 @@ def test_the_head_is_the_same_whoever_played(honest, tmp_path, capsys):
         assert texts[0] == texts[1] and names in texts[0], name
     links = [[line["previous"] for line in lines_of(f)] for f in (honest / "run", tmp_path / "m")]
     assert links[0] != links[1] and audit(tmp_path / "m", capsys, "--head", names) == (0, [])
+    assert {path.name for path in (tmp_path / "m" / "actions").iterdir()} == {"twist2", "sonic"}
+    capsys.readouterr()
+    assert main(["report", str(tmp_path / "m"), "--table"]) == 0
+    assert f"Head of 1 journal: {names}." in capsys.readouterr().out
     records, _ = read_journal(honest / "run" / "episodes.jsonl")
     assert head(sorted(records, key=lambda one: one.index)) == names
 
@@ -247,7 +251,7 @@ FORGERIES = {
     "table.csv": in_table("table.csv", rates),
     "table.md": in_table("table.md", lambda text: text.replace("football", "f00tball", 1)),
     "report.md": in_table("report.md", lambda text: text.replace("| 5", "| 6", 1) + "\n"),
-    "report.html": in_table("report.html", lambda text: text.replace("success", "sucess", 1)),
+    "report.html": in_table("report.html", lambda text: text.replace("success", "failure", 1)),
     "actions changed": other_actions,
     "actions exchanged": exchanged_actions,
     "a careful outcome": careful,

@@ -83,7 +83,7 @@ def lines(*folders):
     """Lines of journals without numbers of the plan, times and hash of the plan, by mode and repeat."""
     found = [json.loads(line) for at in folders for line in (at / "episodes.jsonl").read_text().splitlines()]
     for line in found:
-        for key in ("index", "durations", "started_at", "finished_at"):
+        for key in ("index", "durations", "started_at", "finished_at", "previous"):
             del line[key]
         del line["hashes"]["config"]
     return sorted(found, key=lambda line: (line["mode"], line["repeat"]))

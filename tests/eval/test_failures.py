@@ -265,8 +265,12 @@ def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
     (tmp_path / "b" / "actions").mkdir(parents=True)
     kept_none = document | {"options": document["options"] | {"actions": False}}
     (tmp_path / "b" / "config.json").write_text(json.dumps(kept_none))
+    (tmp_path / "c" / "actions").mkdir(parents=True)
+    through_two = document | {"options": document["options"] | {"tracker": ["sonic", "pd"]}}
+    (tmp_path / "c" / "config.json").write_text(json.dumps(through_two))
     for name, tracker, said in (
         ("a", "sonic", "was played through it"),
+        ("c", "twist2", "was played through sonic pd; name a run through one"),
         ("b", "twist2", "holds no signals or no actions; play it with --failures"),
     ):
         assert main(["report", str(tmp_path / name), "--own-tracker", tracker]) == 2

@@ -68,7 +68,7 @@ def journals(out):
     for path in sorted(out.glob("*/*/*/*/episodes.jsonl")):
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         for line in lines:
-            for key in ("durations", "started_at", "finished_at"):
+            for key in ("durations", "started_at", "finished_at", "previous"):
                 del line[key]
         found[path.parent.relative_to(out).as_posix()] = sorted(lines, key=lambda line: line["index"])
     return found

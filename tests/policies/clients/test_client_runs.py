@@ -58,7 +58,7 @@ def server_of(protocol, port=0):
 def results(folder):
     """Tables and the sorted journal without times."""
     lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-    timed = ("durations", "started_at", "finished_at")
+    timed = ("durations", "started_at", "finished_at", "previous")
     kept = sorted(json.dumps({k: v for k, v in line.items() if k not in timed}, sort_keys=True) for line in lines)
     return {name: (folder / name).read_bytes() for name in TABLES}, kept
 
