@@ -104,8 +104,9 @@ def _ending(record: EpisodeRecord, facts: JsonObject | None) -> Iterator[str]:
         yield f"outcome {outcome} with the reason {shown(reason)}"
     if record.startup_fall != (reason == "startup_fall") or (record.startup_fall and record.steps):
         yield f"startup_fall is {shown(record.startup_fall)} with reason {shown(reason)} after {record.steps} steps"
-    out = [event.detail for event in record.events if event.kind == "object_out"]
-    if record.schema > 1 and outcome == "timeout" and reason != "timeout" and f"{reason}".removesuffix("_out") not in out:
+    objects = [event.detail for event in record.events if event.kind == "object_out"]
+    out = [*objects, *(f"{name}_out" for name in objects)]
+    if record.schema > 1 and outcome == "timeout" and reason not in ("timeout", *out):
         yield f"reason {shown(reason)} without its event"
     startup, played = (facts or {}).get("startup_ticks"), (record.durations or {}).get("sim_s")
     if outcome != "error" and record.steps and isinstance(startup, int) and played is not None:

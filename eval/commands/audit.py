@@ -57,7 +57,7 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
     for folder in named:
         one = audited(folder, options.head)
         if options.replay or options.all:
-            from arena_newton.eval.audit.replay import drawn, replay
+            from arena_newton.eval.audit.action_replay import drawn, replay
 
             replay(one, drawn(one, None if options.all else options.replay, options.draw), factories)
         audits.append(one)

@@ -255,19 +255,16 @@ def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
     """The replay has the run's tasks, modes, seeds and physics; a run that has no actions is refused in a line."""
     given = {"task": ("boxing",), "tracker": ("sonic",), "seeds": (3,), "repeats": 2, "engine": "mujoco"}
     (tmp_path / "a" / "actions").mkdir(parents=True)
-    options = RunOptions(**given, failures=True, actions=True)
-    document = document_of(2) | {"options": dataclasses.asdict(options)}
+    document = document_of(2) | {"options": dataclasses.asdict(RunOptions(**given, failures=True))}
     (tmp_path / "a" / "config.json").write_text(json.dumps(document))
     found = own_options(tmp_path / "a", "twist2")
     assert (found.tracker, found.policy) == (("twist2",), f"replay:{tmp_path / 'a' / 'actions'}")
     assert (found.task, found.seeds, found.repeats, found.engine) == (("boxing",), (3,), 2, "mujoco")
     assert found.out == str(tmp_path / "a" / OWN_FOLDER) and not found.actions and not found.failures
-    (tmp_path / "b" / "actions").mkdir(parents=True)
-    kept_none = document | {"options": document["options"] | {"actions": False}}
-    (tmp_path / "b" / "config.json").write_text(json.dumps(kept_none))
-    (tmp_path / "c" / "actions").mkdir(parents=True)
-    through_two = document | {"options": document["options"] | {"tracker": ["sonic", "pd"]}}
-    (tmp_path / "c" / "config.json").write_text(json.dumps(through_two))
+    for name, changed in (("b", {"actions": False}), ("c", {"tracker": ["sonic", "pd"]})):
+        (tmp_path / name / "actions").mkdir(parents=True)
+        other = document | {"options": document["options"] | changed}
+        (tmp_path / name / "config.json").write_text(json.dumps(other))
     for name, tracker, said in (
         ("a", "sonic", "was played through it"),
         ("c", "twist2", "was played through sonic pd; name a run through one"),

@@ -74,7 +74,7 @@ def replay(audit: Audit, records: Sequence[EpisodeRecord], factories: Factories 
         config, policy = check_parts(dataclasses.replace(config, episodes=tuple(chosen)), made)
         installed = config.identity()
         for key in ("code", "scenes", "rules_hash"):
-            if installed.get(key) != run.config.get(key):  # type: ignore[misc]  # keys of both
+            if installed.get(key) != run.config.get(key):
                 audit.notes.append(f"Replayed with another {key} than the run's: what differs may come of that.")
         try:
             for group in groups(chosen).values():
