@@ -91,8 +91,8 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
         scaled = (key, *scales[s].tolist())
         if scaled not in measured:
             measured[scaled] = _measured(points * scales[s], np.asarray(mesh.indices).reshape(-1, 3))
-        box, bounds[s], small = measured[scaled]
-        casts[s] = 2 if bodies[s] < 0 and _top(poses[s], box) < FLOOR_TOP else small
+        box, bounds[s], is_small = measured[scaled]
+        casts[s] = 2 if bodies[s] < 0 and _top(poses[s], box) < FLOOR_TOP else is_small
         image = getattr(source, "texture", None)
         if image is not None and mesh.uvs is not None:
             if source.texture_hash not in images:
