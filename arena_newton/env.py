@@ -97,7 +97,7 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
-        given = cameras or ({} if camera is None else {FRONT: camera})
+        given = ({} if camera is None else {FRONT: camera}) | dict(cameras or {})
         self.camera_configs = {name: one.named(name) for name, one in given.items()}
         """Configurations of `cameras`."""
         load_kernels(self.engine, device, camera=bool(self.camera_configs), suite=self.spec.suite)
