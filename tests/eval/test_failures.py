@@ -263,8 +263,7 @@ def test_the_own_tracker_plays_the_same_episodes(tmp_path, capsys):
     assert found.out == str(tmp_path / "a" / OWN_FOLDER) and not found.actions and not found.failures
     for name, changed in (("b", {"actions": False}), ("c", {"tracker": ["sonic", "pd"]})):
         (tmp_path / name / "actions").mkdir(parents=True)
-        other = document | {"options": document["options"] | changed}
-        (tmp_path / name / "config.json").write_text(json.dumps(other))
+        (tmp_path / name / "config.json").write_text(json.dumps(document | {"options": document["options"] | changed}))
     for name, tracker, said in (
         ("a", "sonic", "was played through it"),
         ("c", "twist2", "was played through sonic pd; name a run through one"),
