@@ -60,7 +60,7 @@ class Tested:
     comma between); those that come with the package when none is named."""
     policy: str = "expert"
     """Policy that decides it: expert, stand, learned (the one that comes with the package; learned:<folder of eval
-    pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of --actions>, replay:<LeRobot
+    pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of a run>, replay:<LeRobot
     dataset>#<episode, or all>, remote:<url>."""
 
 

@@ -294,6 +294,7 @@ class DealtRun:
         record = EpisodeRecord(
             schema=SCHEMA,
             **planned,
+            privileged=self.config.privileged,
             hashes=self.folder.hashes(episode.tracker, facts),
             outcome="error",
             reason="environment",

@@ -137,7 +137,7 @@ def check(folder, mutants, write, capsys, commands):
         assert inside == {"outer", "outer/inner", "outer/inner/kept", "outer/victim"}, (number, inside)
         assert not Path("/tmp/arena_newton_escape").exists()
         assert (root / "outer" / "victim").read_text() == "mine"
-    assert counts["refused"] > len(mutants) // 2 and counts["accepted"] > 0
+    assert counts["refused"] > len(mutants) // 3 and counts["accepted"] > 0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 1 << 20  # KiB; torch and Warp are most of it
     print(f"{len(mutants)} mutants: {counts}")
 
@@ -155,7 +155,7 @@ def test_mutated_journals(base, mutants, capsys):
         else:
             line = mutated(json.loads(lines[at]), rng)
             made.append(b"".join([*lines[:at], line + b"\n", *lines[at + 1 :]]))
-    check(base, made, path.write_bytes, capsys, (["report"], ["report"], ["resume"]))
+    check(base, made, path.write_bytes, capsys, (["report"], ["audit"], ["resume"]))
 
 
 def test_mutated_configurations(base, mutants, capsys):
@@ -170,7 +170,7 @@ def test_mutated_configurations(base, mutants, capsys):
             made.append(mutated(document, rng))
         else:
             made.append(with_raw(document, (part,), mutated(document[part], rng).decode("latin-1")).encode("latin-1"))
-    check(base, made, path.write_bytes, capsys, (["resume"], ["report"]))
+    check(base, made, path.write_bytes, capsys, (["resume"], ["report"], ["audit"]))
 
 
 def refused(folder, capsys, *words):
