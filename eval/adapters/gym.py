@@ -443,8 +443,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         if self._pixels:
             return tuple(next(iter(self._pixels.values())).copy())
         if self._film is None:
-            film = CameraConfig(*STRIP_SIZES["world"], "world", "native")
-            self._film = Camera.of_config(self.env.scene, film, self.env.lights)
+            self._film = Camera.from_scene(self.env.scene, "world", *STRIP_SIZES["world"], self.env.lights)
         pictures = self.env.render(self._film, self._unfilmed).cpu().numpy()
         self._unfilmed[:] = False
         return tuple(pictures.copy())
