@@ -42,6 +42,8 @@ SERVED = ("openpi", "roboarena", "vla-eval", "arena")
 """Protocols behind a server."""
 SAME_BITS = tuple(name for name in PROTOCOLS if name != "learned")
 """Protocols that promise the bits of `lerobot` on engine mujoco and the CPU."""
+PYTHON = (sys.executable, "-P")
+"""Interpreter of the processes, which does not look for packages in the folder of the call."""
 START_S = 300.0
 """Longest wait until a server listens [s]."""
 END_S = 30.0
@@ -261,7 +263,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
                 served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", protocol]
                 served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
                 served += ["--device", options.device]
-                commands.append([sys.executable, "-m", *served])
+                commands.append([*PYTHON, "-m", *served])
                 spec = stack.enter_context(_server(protocol, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))
             _call(protocol, commands[-1], folder / "output.txt", (0, 1))
@@ -272,7 +274,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
         path = found / "actions" / f"{options.task}_base_{key.replace('/', '_')}.npz"
         episodes.append(ProtocolEpisode(key, outcome, reason, steps, margin, _actions(path)))
     return ProtocolRun(
-        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[1:]]) for line in commands)
+        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[len(PYTHON) :]]) for line in commands)
     )
 
 
@@ -286,7 +288,7 @@ def _actions(path: Path) -> np.ndarray:
 
 def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]:
     """Our runner."""
-    line = [sys.executable, "-m", "arena_newton.eval", "run", "--task", options.task, "--tracker", options.tracker]
+    line = [*PYTHON, "-m", "arena_newton.eval", "run", "--task", options.task, "--tracker", options.tracker]
     line += ["--policy", spec, "--seeds", "0", "--repeats", str(options.episodes), "--worlds", str(options.episodes)]
     line += ["--engine", options.engine, "--device", options.device, "--actions", "--out", str(folder)]
     return line if options.max_steps is None else [*line, "--max-steps", str(options.max_steps)]
@@ -294,7 +296,7 @@ def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]
 
 def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> list[str]:
     """LeRobot's own command line: one world a batch, so that each forward pass has one row as on our CPU."""
-    line = [sys.executable, "-m", "lerobot.scripts.lerobot_eval"]
+    line = [*PYTHON, "-m", "lerobot.scripts.lerobot_eval"]
     line += ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
     line += [f"--env.task={options.task}", f"--env.tracker={options.tracker}", f"--env.engine={options.engine}"]
     line += [f"--env.device={options.device}", f"--env.episodes={folder}", f"--policy.path={checkpoint}"]
