@@ -23,12 +23,13 @@ import numpy as np
 
 from arena_newton import tasks
 from arena_newton.cli.extras import require
-from arena_newton.cli.flags import user_path
+from arena_newton.cli.flags import user_path, words
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.files.own_processes import environment
 from arena_newton.pages.tables import Table
@@ -288,10 +289,20 @@ def _actions(path: Path) -> np.ndarray:
 
 def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]:
     """Our runner."""
-    line = [*PYTHON, "-m", "arena_newton.eval", "run", "--task", options.task, "--tracker", options.tracker]
-    line += ["--policy", spec, "--seeds", "0", "--repeats", str(options.episodes), "--worlds", str(options.episodes)]
-    line += ["--engine", options.engine, "--device", options.device, "--actions", "--out", str(folder)]
-    return line if options.max_steps is None else [*line, "--max-steps", str(options.max_steps)]
+    flags = RunOptions(
+        task=(options.task,),
+        tracker=(options.tracker,),
+        policy=spec,
+        seeds=(0,),
+        repeats=options.episodes,
+        worlds=options.episodes,
+        engine=options.engine,
+        device=options.device,
+        max_steps=options.max_steps,
+        actions=True,
+        out=str(folder),
+    )
+    return [*PYTHON, "-m", "arena_newton.eval", "run", *words(flags)]
 
 
 def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> list[str]:

@@ -118,9 +118,9 @@ def here(monkeypatch, kept_worlds):
     codes = []
 
     def call(command, *, stdout, **_):
-        assert command[:3] == [sys.executable, "-m", "arena_newton.eval"]
+        assert command[:4] == [sys.executable, "-P", "-m", "arena_newton.eval"]
         with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
-            codes.append(main(command[3:], Factories(env=kept_worlds)))
+            codes.append(main(command[4:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
     monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
