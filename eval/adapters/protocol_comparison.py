@@ -143,8 +143,8 @@ def run(options: ProtocolOptions) -> int:
     commands = "\n".join(f"- {row.protocol}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
     write_atomic(out / "protocols.md", f"{message}\n\n{text}\n{commands}\n")
     # Keys of a stored file do not follow the name of the command.
-    compared = [{"door": row.protocol, **asdict(row)} for row in rows]
-    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": compared}
+    compared = [asdict(row) for row in rows]
+    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "protocols": compared}
     write_atomic(out / "protocols.json", json.dumps(facts, indent=2) + "\n")
     print(f"\n{message}\n\n{text}")
     broken = [row.protocol for row in rows if not row.kept]
