@@ -180,7 +180,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._cameras: dict[str, Camera] = {}
         if size is not None:
             for name, one in wanted.items():
-                shown = one if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
+                shown = one.named(name) if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
                 _size((shown.width, shown.height), f"cameras: {name}")
                 if shown.depth:
                     raise InputError(f"cameras: {name}: depth is not observed")
