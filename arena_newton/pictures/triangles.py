@@ -66,6 +66,7 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     bodies, poses = model.shape_body.numpy(), model.shape_transform.numpy()
     vertices, normals, uvs, faces, texels, layouts = [], [], [], [], [], []
     packed: dict[Hashable, tuple[Mesh, np.ndarray, tuple[int, int]]] = {}
+    extents: dict[Hashable, tuple[np.ndarray, np.ndarray, np.ndarray, bool]] = {}  # the same in every world
     images: dict[int, int] = {}
     at_vertex = at_face = at_texel = 0
     for s in shapes:
@@ -87,14 +88,11 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
             at_vertex, at_face = at_vertex + len(points), at_face + len(corner)
         mesh, points, face_range[s] = packed[key]
         scales[s] = sizes[s] if source is not None else 1.0
-        low, high = (points * scales[s]).min(axis=0), (points * scales[s]).max(axis=0)
-        if bodies[s] < 0 and _top(poses[s], np.array([low, high])) < FLOOR_TOP:
-            casts[s] = 2
-        else:
-            p0, p1, p2 = (points * scales[s])[np.asarray(mesh.indices).reshape(-1, 3)].swapaxes(0, 1)
-            casts[s] = np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=-1).mean() < LARGE_TRIANGLE
-        bounds[s, :3] = 0.5 * (low + high)
-        bounds[s, 3] = np.linalg.norm(points * scales[s] - bounds[s, :3], axis=1).max()
+        scaled = key, *scales[s].tolist()
+        if scaled not in extents:
+            extents[scaled] = _extent(points * scales[s], mesh.indices)
+        low, high, bounds[s], small = extents[scaled]
+        casts[s] = 2 if bodies[s] < 0 and _top(poses[s], np.array([low, high])) < FLOOR_TOP else small
         image = getattr(source, "texture", None)
         if image is not None and mesh.uvs is not None:
             if source.texture_hash not in images:
@@ -134,6 +132,16 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     soup.texels = array(np.concatenate(texels) if texels else np.zeros(0, np.uint8), wp.uint8)
     soup.texture_layout = array(np.array(layouts, np.int32).reshape(-1, 3), wp.vec3i)
     return soup, most(start[:-1], start[1:]), (most(start[:-1], large), most(large, small))
+
+
+def _extent(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Corners of a mesh's box, its bounding sphere (centre, radius) [m], and True where its triangles are small."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    radius = np.linalg.norm(points - middle, axis=1).max()
+    p0, p1, p2 = points[np.asarray(indices).reshape(-1, 3)].swapaxes(0, 1)
+    small = np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=-1).mean() < LARGE_TRIANGLE
+    return low, high, np.append(middle, radius), bool(small)
 
 
 def _top(pose: np.ndarray, box: np.ndarray) -> float:
