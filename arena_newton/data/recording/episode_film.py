@@ -42,7 +42,7 @@ class FilmFacts:
     frames: int
     """Number of pictures."""
     histogram: np.ndarray
-    """Pixels of all pictures by channel and value, int64, shape [3, 256]."""
+    """Pixels of all pictures by channel and value, int64, shape [3, 256]; zero of a film without loss."""
     depth_shape: tuple[int, ...]
     """Shape of a picture's depth, [H, W]; empty where none was recorded."""
 
@@ -77,7 +77,8 @@ class Film:
             gop = key_frames(height)
             self._writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, **self._how)
         self._writer.write(picture)
-        add_picture(self._histogram, picture)
+        if not self._how["lossless"]:
+            add_picture(self._histogram, picture)
         if depth is not None:
             if self._depth_file is None:
                 self._depth_file, self._depth_shape = create(self.depth), depth.shape
