@@ -102,7 +102,7 @@ class VideoWriter:
         self._stream = stream
         self._stream.height, self._stream.width = self._size
         self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
-        # One frame for all pictures: the encoder copies what it needs. Its plane begins black, also where odd sizes pad.
+        # One frame for all pictures, which the encoder copies; black where odd sizes are padded.
         self._frame = av.VideoFrame(self._size[1], self._size[0], "rgb24")
         (plane,) = self._frame.planes
         whole = np.ndarray((*self._size, 3), np.uint8, plane, strides=(plane.line_size, 3, 1))
@@ -131,7 +131,7 @@ class VideoWriter:
         if pixels.shape[:2] != (self.height, self.width):
             raise ArenaError(f"{self.path}: expected frames of {self.width}×{self.height}, got {pixels.shape[1::-1]}")
         self._pixels[:] = pixels
-        self._frame.pts = None
+        self._frame.pts = self.frames
         try:
             self._mux(self._stream.encode(self._frame))
         except OSError as error:
