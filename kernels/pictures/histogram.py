@@ -13,14 +13,14 @@ def _histogram(pictures: wp.array4d[wp.uint8], counted: wp.array[wp.bool], histo
     if not counted[world]:
         return
     # Neighbours of one value are added at once: threads that add to the same number wait for each other.
-    value, run = wp.int32(pictures[world, row, 0, channel]), wp.int32(0)
-    for column in range(pictures.shape[2]):
-        seen = wp.int32(pictures[world, row, column, channel])
+    line, counts = pictures[world, row], histogram[world, channel]
+    value, start = wp.int32(line[0, channel]), wp.int32(0)
+    for column in range(line.shape[0]):
+        seen = wp.int32(line[column, channel])
         if seen != value:
-            wp.atomic_add(histogram, world, channel, value, wp.int64(run))
-            value, run = seen, 0
-        run += 1
-    wp.atomic_add(histogram, world, channel, value, wp.int64(run))
+            wp.atomic_add(counts, value, wp.int64(column - start))
+            value, start = seen, column
+    wp.atomic_add(counts, value, wp.int64(line.shape[0] - start))
 
 
 def launch_histogram(pictures: wp.array, counted: wp.array, histogram: wp.array) -> None:
