@@ -80,7 +80,7 @@ class ArenaEnv:
             fast_physics: Use the tracker's fast physics rate.
             drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
             camera: Head camera for policies that see: the same as `cameras={"front": camera}`.
-            cameras: Cameras for policies that see, by the names of their pictures.
+            cameras: Cameras for policies that see, by the names of their pictures (`CameraConfig.named`).
             threads: CPU threads of engine `mujoco`; all by default.
 
         Raises:
@@ -100,7 +100,8 @@ class ArenaEnv:
         self.tracker = tracker
         self.worlds = worlds
         self.engine, device = resolve_engine(engine, device)
-        self.camera_configs = dict(cameras or ({} if camera is None else {FRONT: camera}))
+        given = ({} if camera is None else {FRONT: camera}) | dict(cameras or {})
+        self.camera_configs = {name: one.named(name) for name, one in given.items()}
         """Configurations of `cameras`."""
         load_kernels(self.engine, device, camera=bool(self.camera_configs), suite=self.spec.suite)
         original = tracker.original_drive if self.rules.original_drive else None

@@ -72,7 +72,7 @@ class Observation:
     [worlds, H, W]; of cameras with `depth`, and of worlds that ask."""
 
     def __post_init__(self) -> None:
-        """One of `image` and `images` says the other."""
+        """Complete `image` and `images` by each other."""
         if self.image is not None and not self.images:
             self.images = {"front": self.image}
         self.image = self.images.get("front")

@@ -64,17 +64,17 @@ class CameraConfig:
     depth: bool = False
     """Observe depth next to the picture; for policies."""
 
+    def named(self, name: str) -> CameraConfig:
+        """The camera of a name in `CAMERAS`, where `prim` is left at its default."""
+        return self if self.prim != CameraConfig.prim else replace(self, prim=CAMERAS.get(name, self.prim))
+
 
 def policy_cameras(policy: Policy) -> dict[str, CameraConfig]:
-    """Pictures that a policy wants, by name: its `cameras`, or the head camera's alone where it `needs_image`.
-
-    A camera of `CAMERAS` whose `prim` is left at its default is the one of its name.
-    """
+    """Pictures that a policy wants, by name: its `cameras`, or the head camera's alone where it `needs_image`."""
     named: Mapping[str, CameraConfig] | None = getattr(policy, "cameras", None)  # a plug-in need not know of several
     if named is None:
         return {FRONT: getattr(policy, "camera", None) or CameraConfig()} if policy.needs_image else {}
-    own = CameraConfig.prim
-    return {name: replace(one, prim=CAMERAS.get(name, own)) if one.prim == own else one for name, one in named.items()}
+    return dict(named)
 
 
 def robot_fit(width: int, height: int) -> Fit:

@@ -66,7 +66,7 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     bodies, poses = model.shape_body.numpy(), model.shape_transform.numpy()
     vertices, normals, uvs, faces, texels, layouts = [], [], [], [], [], []
     packed: dict[Hashable, tuple[Mesh, np.ndarray, tuple[int, int]]] = {}
-    extents: dict[Hashable, tuple[np.ndarray, np.ndarray, np.ndarray, int]] = {}  # the same in every world
+    measured: dict[Hashable, tuple[np.ndarray, np.ndarray, bool]] = {}  # worlds have most shapes in common
     images: dict[int, int] = {}
     at_vertex = at_face = at_texel = 0
     for s in shapes:
@@ -88,11 +88,11 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
             at_vertex, at_face = at_vertex + len(points), at_face + len(corner)
         mesh, points, face_range[s] = packed[key]
         scales[s] = sizes[s] if source is not None else 1.0
-        scaled = key, *scales[s].tolist()
-        if scaled not in extents:
-            extents[scaled] = _extent(points * scales[s], mesh.indices)
-        low, high, bounds[s], caster = extents[scaled]
-        casts[s] = 2 if bodies[s] < 0 and _top(poses[s], np.array([low, high])) < FLOOR_TOP else caster
+        scaled = (key, *scales[s].tolist())
+        if scaled not in measured:
+            measured[scaled] = _measured(points * scales[s], np.asarray(mesh.indices).reshape(-1, 3))
+        box, bounds[s], is_small = measured[scaled]
+        casts[s] = 2 if bodies[s] < 0 and _top(poses[s], box) < FLOOR_TOP else is_small
         image = getattr(source, "texture", None)
         if image is not None and mesh.uvs is not None:
             if source.texture_hash not in images:
@@ -134,14 +134,13 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     return soup, most(start[:-1], start[1:]), (most(start[:-1], large), most(large, small))
 
 
-def _extent(points: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Corners of a mesh's box, bounding sphere (centre, radius) [m], and 1 where its triangles are small, else 0."""
+def _measured(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Two corners of the box around points [m], its centre and their largest distance from it, small triangles."""
     low, high = points.min(axis=0), points.max(axis=0)
-    middle = 0.5 * (low + high)
-    radius = np.linalg.norm(points - middle, axis=1).max()
-    p0, p1, p2 = points[np.asarray(indices).reshape(-1, 3)].swapaxes(0, 1)
-    small = np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=-1).mean() < LARGE_TRIANGLE
-    return low, high, np.append(middle, radius), int(small)
+    centre = 0.5 * (low + high)
+    p0, p1, p2 = points[faces].swapaxes(0, 1)
+    small = bool(np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=-1).mean() < LARGE_TRIANGLE)
+    return np.array([low, high]), np.array([*centre, np.linalg.norm(points - centre, axis=1).max()]), small
 
 
 def _top(pose: np.ndarray, box: np.ndarray) -> float:

@@ -180,7 +180,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self._cameras: dict[str, Camera] = {}
         if size is not None:
             for name, one in wanted.items():
-                shown = one if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
+                shown = one.named(name) if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
                 if shown.depth:
                     raise InputError(f"cameras: {name}: depth is not observed")
                 self._cameras[name] = Camera.of_config(self.env.scene, shown, self.env.lights)

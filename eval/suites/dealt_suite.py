@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.run_flow import Group, begun, reported
@@ -55,6 +56,8 @@ class _Cell:
     number: int
     """Its position among those to play."""
     group: Group
+    scene: str
+    """Name of its task's scene in its mode."""
     episodes: int
     """Not yet in its journal."""
     job: Job
@@ -112,7 +115,8 @@ class _PoolPlayer(CellPlayer):
     def _cell(self, name: str, number: int) -> _Cell:
         cell, results = self.folder.plan.cell(name), self.results(name)
         left = cell.episodes - self.folder.counts(name)["finished"]
-        return _Cell(name, number, (cell.task, cell.tracker, cell.mode), max(left, 1), Job(results))
+        scene = tasks.get(cell.task).scene_name(cell.mode, rule_sets.get(cell.rules))
+        return _Cell(name, number, (cell.task, cell.tracker, cell.mode), scene, max(left, 1), Job(results))
 
     def _ticks_left(self, cell: _Cell) -> int:
         whole = self.folder.plan.cell(cell.name)
@@ -132,6 +136,7 @@ class _PoolPlayer(CellPlayer):
     def _give(self, worker: Worker) -> None:
         """Give work to a process that waits: a batch of the run that it has open, or another run to open."""
         busy = {one.assignment.group for one in self.pool.workers if one.assignment is not None}
+        there = {(*cell.group[:2], cell.scene) for cell in self.cells if cell.group == worker.last}
 
         def wanted(cell: _Cell) -> bool:
             if not cell.open or cell.dealt is None or cell.job is worker.job:
@@ -139,9 +144,10 @@ class _PoolPlayer(CellPlayer):
             coming = [one for one in self.pool.workers if one.job is cell.job and one.assignment is None]
             return len(coming) < cell.dealt.batches  # no more open it than find something to play
 
-        def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
-            fresh = cell.dealt is None
-            return cell.job is not worker.job, cell.group != worker.last, fresh, cell.group in busy, cell.number
+        def order(cell: _Cell) -> tuple[bool, bool, bool, bool, bool, int]:
+            fresh, elsewhere = cell.dealt is None, (*cell.group[:2], cell.scene) not in there
+            last = cell.job is not worker.job, cell.group != worker.last, elsewhere
+            return *last, fresh, cell.group in busy, cell.number
 
         found = min(filter(wanted, self.cells), key=order, default=None)
         if found is None:

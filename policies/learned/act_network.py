@@ -78,6 +78,11 @@ class FrozenNorm(nn.Module):
         return x * scale[:, None, None] + shift[:, None, None]
 
 
+def _positions(count: int, width: int) -> nn.Embedding:
+    """Learned positions; an embedding's own random numbers load seconds of torch on the device `meta`."""
+    return nn.Embedding.from_pretrained(torch.rand(count, width), freeze=False)
+
+
 def _convolution(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, size, stride=stride, padding=size // 2, bias=False)
 
@@ -214,8 +219,8 @@ class ActNetwork(nn.Module):
             self.encoder_env_state_input_proj = nn.Linear(sizes.tasks, width)
         self.encoder_latent_input_proj = nn.Linear(sizes.latent_dim, width)
         self.encoder_img_feat_input_proj = nn.Conv2d(WIDTHS[-1], width, 1)
-        self.encoder_1d_feature_pos_embed = nn.Embedding(3 if sizes.tasks else 2, width)
-        self.decoder_pos_embed = nn.Embedding(sizes.chunk_size, width)
+        self.encoder_1d_feature_pos_embed = _positions(3 if sizes.tasks else 2, width)
+        self.decoder_pos_embed = _positions(sizes.chunk_size, width)
         self.action_head = nn.Linear(width, sizes.actions)
         self._on_host: Callable[[torch.Tensor], torch.Tensor] | None = None
 
@@ -243,7 +248,7 @@ class ActNetwork(nn.Module):
         unknown = sorted(set(weights) - {f"model.{name}" for name in own})
         if unknown:
             raise KeyError(unknown[0])
-        self.load_state_dict({name: value.float() for name, value in own.items()})
+        self.load_state_dict({name: value.to(torch.float32, copy=True) for name, value in own.items()}, assign=True)
         self.requires_grad_(False).eval()
         self.backbone.fold()
 

@@ -186,6 +186,15 @@ def test_one_crew_for_all_cells(undisturbed):
     assert changes <= 4, groups
 
 
+def test_a_process_stays_in_its_scene(inline, suite, tmp_path):
+    """The next cell of a process is one whose mode has the scene of the last, as one environment serves both."""
+    suite.write_text(SUITE.replace('["base", "visual"]', '["base", "semantic", "visual"]'))
+    fake = inline()
+    assert call(suite, tmp_path / "out", "--ray-actors", "1", "--only", "policy=expert") == 0
+    cells = ["/".join(folder.split("/")[-2:]) for _, folder in fake.opened]
+    assert cells == [f"{task}/{mode}" for task in ("boxing", "football") for mode in ("base", "visual", "semantic")]
+
+
 @pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
