@@ -25,9 +25,9 @@ from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.export import export
 from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
-from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.terms import events
 from arena_newton.trackers.train.terms.critic import CRITIC
+from arena_newton.trackers.train.terms.measurement import TrainingError
 from arena_newton.trackers.train.terms.rewards import Term
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
