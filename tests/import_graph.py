@@ -40,11 +40,17 @@ INNER = {
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
     f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
         | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
+    f"{PACKAGE}.policies.train": """frames network_memory policy_options teachable_network training_log
+        | checkpoint_packing families stored_flags teachable | network_compiler | policy_trainer | training_state
+        | training_loop | training | training_check __main__""",
+    f"{PACKAGE}.trackers": """interface motions | base | inference | front_end
+        | evaluation pd sonic tracker_check train twist2 | evaluate __main__""",
 }
 """Folder → its rooms and single modules from the bottom to the top: each imports from those before it. Imports for type
 checkers count here."""
 NAMES_ABOVE = {
     f"{PACKAGE}.interfaces": "protocols name the types that they connect",
+    f"{PACKAGE}.trackers.interface": "an interface names the front end and the network that it stands for",
     f"{PACKAGE}.tasks": "a judge is handed the scene and the physics that it reads",
 }
 """Rooms whose imports for type checkers may name what stands above them, and why."""

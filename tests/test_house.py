@@ -181,7 +181,7 @@ def test_the_page_of_rooms_names_each():
     """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
     page = (ROOT / "docs" / "design" / "rooms.md").read_text()
     packages = {module.name for module in known().values() if module.path.name == "__init__.py"}
-    for folder in (PACKAGE, f"{PACKAGE}.data", f"{PACKAGE}.policies", f"{PACKAGE}.eval"):
+    for folder in (PACKAGE, *(f"{PACKAGE}.{name}" for name in ("data", "trackers", "policies", "eval"))):
         title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"
         listed = re.findall(r"^\| `(\w+)` \|", page.split(f"### `{title}`")[1].split("\n#")[0], flags=re.MULTILINE)
         groups = [[p for p in part.split() if f"{folder}.{p}" in packages] for part in INNER[folder].split("|")]

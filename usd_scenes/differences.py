@@ -97,7 +97,7 @@ def differences(path: str | Path, task: str) -> list[str]:
 
 
 def _drawn_apart(theirs: Usd.Stage, ours: Usd.Stage, path: str) -> str | None:
-    """That a body is drawn of another size than it collides with, more than in our own scene; None where it is not."""
+    """Difference of a body's drawn size from that which collides, if more than in our own scene; else None."""
     drawn, solid = _extents(theirs, path)
     own_drawn, own_solid = _extents(ours, path)
     if np.abs((drawn - solid) - (own_drawn - own_solid)).max() <= _APART:

@@ -102,6 +102,12 @@ class VideoWriter:
         self._stream = stream
         self._stream.height, self._stream.width = self._size
         self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
+        # One frame for all pictures, which the encoder copies; black where odd sizes are padded.
+        self._frame = av.VideoFrame(self._size[1], self._size[0], "rgb24")
+        (plane,) = self._frame.planes
+        whole = np.ndarray((*self._size, 3), np.uint8, plane, strides=(plane.line_size, 3, 1))
+        whole[:] = 0
+        self._pixels = whole[: self.height, : self.width]
         # One encoder thread: videos are written during a simulation that uses every core.
         self._stream.codec_context.thread_count = 1
         # Without mbtree: it reads memory that nobody wrote, so that equal frames give different bytes now and then.
@@ -124,10 +130,10 @@ class VideoWriter:
         pixels = _rgb(frame)
         if pixels.shape[:2] != (self.height, self.width):
             raise ArenaError(f"{self.path}: expected frames of {self.width}×{self.height}, got {pixels.shape[1::-1]}")
-        if self._size != pixels.shape[:2]:
-            pixels = np.pad(pixels, ((0, self._size[0] - self.height), (0, self._size[1] - self.width), (0, 0)))
+        self._pixels[:] = pixels
+        self._frame.pts = self.frames
         try:
-            self._mux(self._stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            self._mux(self._stream.encode(self._frame))
         except OSError as error:
             self.discard()
             raise _named(error, self.path) from None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -273,7 +273,8 @@ class _Trial:
         if camera is not None and not isinstance(camera, CameraConfig):
             raise Violation(f"camera is a {type(camera).__name__}, expected a CameraConfig or None")
         cameras = getattr(policy, "cameras", None)
-        if cameras is not None and not all(isinstance(one, CameraConfig) for one in dict(cameras).values()):
+        named = isinstance(cameras, Mapping) and all(isinstance(one, CameraConfig) for one in cameras.values())
+        if cameras is not None and not named:
             raise Violation("cameras is no mapping of names to CameraConfig")
         if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= MAX_CHUNK:
             raise Violation(f"chunk_size is {size!r}, expected a whole number from 1 to {MAX_CHUNK}")

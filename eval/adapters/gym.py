@@ -153,7 +153,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         self.repeats = _at_least_1("repeats", repeats)
         self.num_envs = _at_least_1("num_envs", num_envs)
         cap = None if max_episode_steps is None else _at_least_1("max_episode_steps", max_episode_steps)
-        size = None if image_size is None else _size(image_size)
+        size = None if image_size is None else _size(image_size, other=", or None")
         _choice("fit", fit, get_args(Fit))
         wanted = {"": "ego"} if cameras is None else cameras
         self.env = ArenaEnv(
@@ -181,6 +181,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         if size is not None:
             for name, one in wanted.items():
                 shown = one.named(name) if isinstance(one, CameraConfig) else CameraConfig(*size, one, fit)
+                _size((shown.width, shown.height), f"cameras: {name}")
                 if shown.depth:
                     raise InputError(f"cameras: {name}: depth is not observed")
                 self._cameras[name] = Camera.of_config(self.env.scene, shown, self.env.lights)
@@ -442,8 +443,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         if self._pixels:
             return tuple(next(iter(self._pixels.values())).copy())
         if self._film is None:
-            film = CameraConfig(*STRIP_SIZES["world"], "world", "native")
-            self._film = Camera.of_config(self.env.scene, film, self.env.lights)
+            self._film = Camera.from_scene(self.env.scene, "world", *STRIP_SIZES["world"], self.env.lights)
         pictures = self.env.render(self._film, self._unfilmed).cpu().numpy()
         self._unfilmed[:] = False
         return tuple(pictures.copy())
@@ -560,9 +560,9 @@ def _at_least_1(name: str, given: int) -> int:
     return int(given)
 
 
-def _size(given: Sequence[int]) -> tuple[int, int]:
+def _size(given: Sequence[int], where: str = "image_size", other: str = "") -> tuple[int, int]:
     if len(given) != 2 or min(given) < 1:
-        raise InputError(f"image_size {list(given)}: expected width and height of at least 1 [px], or None")
+        raise InputError(f"{where} {list(given)}: expected width and height of at least 1 [px]{other}")
     return int(given[0]), int(given[1])
 
 

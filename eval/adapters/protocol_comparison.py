@@ -23,12 +23,13 @@ import numpy as np
 
 from arena_newton import tasks
 from arena_newton.cli.extras import require
-from arena_newton.cli.flags import user_path
+from arena_newton.cli.flags import user_path, words
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
+from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.files.own_processes import environment
 from arena_newton.pages.tables import Table
@@ -42,6 +43,8 @@ SERVED = ("openpi", "roboarena", "vla-eval", "arena")
 """Protocols behind a server."""
 SAME_BITS = tuple(name for name in PROTOCOLS if name != "learned")
 """Protocols that promise the bits of `lerobot` on engine mujoco and the CPU."""
+PYTHON = (sys.executable, "-P")
+"""Interpreter of the processes, which does not look for packages in the folder of the call."""
 START_S = 300.0
 """Longest wait until a server listens [s]."""
 END_S = 30.0
@@ -140,8 +143,8 @@ def run(options: ProtocolOptions) -> int:
     commands = "\n".join(f"- {row.protocol}: " + "; ".join(f"`{line}`" for line in row.commands) for row in rows)
     write_atomic(out / "protocols.md", f"{message}\n\n{text}\n{commands}\n")
     # Keys of a stored file do not follow the name of the command.
-    compared = [{"door": row.protocol, **asdict(row)} for row in rows]
-    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "doors": compared}
+    compared = [asdict(row) for row in rows]
+    facts = {"flags": asdict(options), "checkpoint": str(checkpoint), "protocols": compared}
     write_atomic(out / "protocols.json", json.dumps(facts, indent=2) + "\n")
     print(f"\n{message}\n\n{text}")
     broken = [row.protocol for row in rows if not row.kept]
@@ -261,7 +264,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
                 served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", protocol]
                 served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
                 served += ["--device", options.device]
-                commands.append([sys.executable, "-m", *served])
+                commands.append([*PYTHON, "-m", *served])
                 spec = stack.enter_context(_server(protocol, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))
             _call(protocol, commands[-1], folder / "output.txt", (0, 1))
@@ -272,7 +275,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
         path = found / "actions" / f"{options.task}_base_{key.replace('/', '_')}.npz"
         episodes.append(ProtocolEpisode(key, outcome, reason, steps, margin, _actions(path)))
     return ProtocolRun(
-        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[1:]]) for line in commands)
+        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[len(PYTHON) :]]) for line in commands)
     )
 
 
@@ -286,15 +289,25 @@ def _actions(path: Path) -> np.ndarray:
 
 def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]:
     """Our runner."""
-    line = [sys.executable, "-m", "arena_newton.eval", "run", "--task", options.task, "--tracker", options.tracker]
-    line += ["--policy", spec, "--seeds", "0", "--repeats", str(options.episodes), "--worlds", str(options.episodes)]
-    line += ["--engine", options.engine, "--device", options.device, "--actions", "--out", str(folder)]
-    return line if options.max_steps is None else [*line, "--max-steps", str(options.max_steps)]
+    flags = RunOptions(
+        task=(options.task,),
+        tracker=(options.tracker,),
+        policy=spec,
+        seeds=(0,),
+        repeats=options.episodes,
+        worlds=options.episodes,
+        engine=options.engine,
+        device=options.device,
+        max_steps=options.max_steps,
+        actions=True,
+        out=str(folder),
+    )
+    return [*PYTHON, "-m", "arena_newton.eval", "run", *words(flags)]
 
 
 def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> list[str]:
     """LeRobot's own command line: one world a batch, so that each forward pass has one row as on our CPU."""
-    line = [sys.executable, "-m", "lerobot.scripts.lerobot_eval"]
+    line = [*PYTHON, "-m", "lerobot.scripts.lerobot_eval"]
     line += ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
     line += [f"--env.task={options.task}", f"--env.tracker={options.tracker}", f"--env.engine={options.engine}"]
     line += [f"--env.device={options.device}", f"--env.episodes={folder}", f"--policy.path={checkpoint}"]

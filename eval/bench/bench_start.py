@@ -7,7 +7,6 @@ tick"): it begins with the environment. The seconds that interpreter and librari
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from arena_newton.cli.quiet import quiet_warp
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError
 from arena_newton.eval.bench.timing import BenchFigure
+from arena_newton.files.own_processes import environment
 from arena_newton.kernel_cache import kernel_loading
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import STAND_ACTION
@@ -89,10 +89,10 @@ def _judged(parts: dict[str, float]) -> float:
 def _start(cache: str, worlds: int, threads: int) -> dict[str, float]:
     """Seconds of the parts of a process, from its start to its first tick."""
     code = f"from arena_newton.eval.bench.bench_start import first_tick; first_tick('boxing', {worlds}, {threads})"
-    environment = os.environ | {"WARP_CACHE_PATH": cache, "CUDA_CACHE_PATH": f"{cache}/cuda"}
+    variables = environment() | {"WARP_CACHE_PATH": cache, "CUDA_CACHE_PATH": f"{cache}/cuda"}
     began = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=TIMEOUT
+        [sys.executable, "-P", "-c", code], env=variables, capture_output=True, text=True, timeout=TIMEOUT
     )
     seconds = time.perf_counter() - began
     if done.returncode:

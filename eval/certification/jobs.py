@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from arena_newton.cli.flags import shell_command, words
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.agreement import BATCHED_TASKS
+from arena_newton.files.own_processes import environment
 from arena_newton.physics.devices import resolve_engine
 from arena_newton.tasks import get
 
@@ -143,14 +144,14 @@ def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str],
 
     def work(slot: int) -> None:
         own = cores[slot :: options.jobs] or cores[slot % len(cores) :][:1]
-        environment = {**os.environ, "OMP_NUM_THREADS": str(len(own))}
+        variables = environment() | {"OMP_NUM_THREADS": str(len(own))}
         while not stopped.is_set():
             try:
                 piece = waiting.get_nowait()
             except queue.Empty:
                 return
-            command = [sys.executable, "-m", "arena_newton.eval", "certify", *flags(options, piece)]
-            process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            command = [sys.executable, "-P", "-m", "arena_newton.eval", "certify", *flags(options, piece)]
+            process = subprocess.Popen(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
             running.add(process)
             if piece.cores:
                 with contextlib.suppress(ProcessLookupError):

@@ -249,9 +249,9 @@ class RunOptions(
     """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
 
     Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
-    both trackers, a few episodes each (about two minutes on two CPU cores), a policy that sees does one of them where
-    one comes with the package, and the report opens with film strips. As soon as one of them is given, the rest follows
-    the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
+    both trackers, a few episodes each (about two minutes on two CPU cores), the policy that comes with the package, if
+    one does, solves those that its card names through the first of them, and the report opens with film strips. As soon
+    as one of these flags is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
     """
 
     viewer_failures: bool = False

@@ -30,9 +30,9 @@ This and the next two are declared where fewer than `ENOUGH` trainings of a reci
 cells of three trainings in docs/results/README.md, "One training is one sample", which differ in steps and in part in
 demonstrations and code too, so they are rough, and rather too large than too small."""
 SWAPPED_SPREAD = 0.26
-"""That of a rate through another tracker."""
+"""Spread of a rate through another tracker."""
 DROP_SPREAD = 0.28
-"""That of the difference of a training's rates through both trackers, and, as none was measured, under two modes."""
+"""Spread of the difference of a training's rates through both trackers, and, as none was measured, under two modes."""
 ENOUGH = 3
 """Trainings of a recipe from which their own standard deviation is taken."""
 

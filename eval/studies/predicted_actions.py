@@ -73,7 +73,7 @@ class DatasetObservations:
         self.tracker = trackers[0] if len(trackers) == 1 else ""
         """The tracker that all its episodes were recorded through; empty where it is not one."""
         self.name = self.tracker or self.root.name
-        """That tracker, or the folder's name."""
+        """Name of the tracker, or that of the folder."""
         self._frames: dict[str, Frames] = {}
 
     @property

@@ -95,7 +95,7 @@ class PaperTransfer:
     family: str
     trained_on: str
     tracker: str
-    """That executed it."""
+    """Tracker that executed it."""
     task: str
     drop: float
     """Matched minus swapped success rate."""

@@ -31,7 +31,7 @@ DEPTH_ORIGIN = wp.constant(wp.float32(256.0))
 BIAS = wp.constant(wp.float32(3.0e-3))
 """Least height of a caster above the receiver's tangent plane, in addition to a fraction of a texel [m]."""
 TEXEL_BIAS = wp.constant(wp.float32(0.35))
-"""That fraction: smooth normals tilt the tangent planes of facets."""
+"""Fraction of a texel: smooth normals tilt the tangent planes of facets."""
 STEEPEST = wp.constant(wp.float32(10.0))
 """Largest slope of a receiver's tangent plane; steeper ones get little light."""
 LANES = (32, 4)

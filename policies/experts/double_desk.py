@@ -98,7 +98,7 @@ next, 0.4 s later, and the joint's whole range in the longest grasp."""
 OVER_ROLL = 0.8
 """The same over the crate [rad/s]: letting go is shorter."""
 RIGHT_ROLL = int(WRISTS[1, 0])
-"""That joint among the columns of `MotionCommand.arms`."""
+"""Right wrist's roll among the columns of `MotionCommand.arms`."""
 MOST_ROLL = 1.9
 """Largest angle of that roll [rad]: the joint ends at 1.97."""
 LOOK_RIGHT, LOOK_LEFT = -0.5 * math.pi, 0.5 * math.pi

@@ -43,7 +43,6 @@ def _is_json(value: object) -> bool:
 Side = Annotated[int, Fit("pixels", lambda value: PICTURE_SIDES[0] <= value <= PICTURE_SIDES[1])]
 Names = Annotated[tuple[str, ...], Fit("a list of names", lambda value: len(value) <= MOST_NAMES)]
 Length = Annotated[int, Fit("a number of actions", lambda value: 0 <= value <= LONGEST_CHUNK)]
-Camera = Annotated[str, Known(lambda: CAMERAS)]
 Labels = Annotated[str, Known(lambda: LABELS)]
 Facts = Annotated[Mapping[str, object], Fit("a JSON object", _is_json)]
 
@@ -70,6 +69,12 @@ class ServedPicture:
         return CameraConfig(width=self.width, height=self.height, fit=self.fit)
 
 
+Cameras = Annotated[
+    Mapping[Annotated[str, Known(lambda: CAMERAS)], ServedPicture],
+    Fit(f"width, height and fit of pictures of {', '.join(CAMERAS)} or some of these", lambda cameras: bool(cameras)),
+]
+
+
 @dataclass(frozen=True)
 class ServedFacts:
     """Facts that a server declares; None: not declared."""
@@ -93,7 +98,7 @@ class ServedFacts:
     """True if the policy observes pictures."""
     picture: ServedPicture | None = None
     """The head camera's picture that it looks at; pictures of other sizes are resized by the server."""
-    cameras: Mapping[Camera, ServedPicture] | None = None
+    cameras: Cameras | None = None
     """The picture of each camera, where they are not the head camera's alone."""
     batched: bool = False
     """True if one request may hold several robots, along a leading axis."""

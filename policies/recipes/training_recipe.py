@@ -60,7 +60,7 @@ class TrainingRecipe:
     lr: float = 1e-4
     """Highest learning rate."""
     lr_backbone: float = 1e-4
-    """That of the vision encoder."""
+    """Highest learning rate of the vision encoder."""
     optimizer: str = "adamw"
     """`adamw`, or `adam`, whose decay is part of the gradient."""
     weight_decay: float = 0.0

@@ -223,8 +223,9 @@ class PolicyServer:
         """
         self.policy.check()
         for name, camera in self._cameras.items():
-            if name not in CAMERAS or camera.depth:
-                kind = f"the depth of {name}" if camera.depth else f"camera {name}"
+            prim = camera.named(name).prim
+            if CAMERAS.get(name) != prim or camera.depth:
+                kind = f"the depth of {name}" if camera.depth else f"camera {prim} as {name}"
                 raise InputError(f"--policy {self.policy.name}: observes {kind}, which no protocol carries")
         known = self._known.get(task, _Task(task, task, ""))
         everyone = np.ones(self.max_sessions, dtype=bool)

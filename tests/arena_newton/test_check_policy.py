@@ -246,6 +246,15 @@ def test_each_check_finds_its_fault(broken):
         assert set(failed) - {name} <= {Crowd: {"asks", "batch", "errors", "reset"}}.get(broken, set()), failed
 
 
+@pytest.mark.parametrize("cameras", [["front"], {"front": "ego"}])
+def test_cameras_are_named_configurations(cameras):
+    """Cameras that are no mapping of names to configurations are said to be that."""
+    policy = Swaying()
+    policy.cameras = cameras
+    with pytest.raises(ConformanceError, match="cameras is no mapping of names to CameraConfig"):
+        check_policy(policy)
+
+
 def test_every_check_has_a_broken_policy():
     """No check is without a policy that fails it."""
     assert {name for name, _ in BROKEN.values()} == set(NAMES)

@@ -1,6 +1,7 @@
 """Certification by several processes: what each is asked for, in which order, and that a broken one stops nothing."""
 
 import signal
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import tyro
 
+import arena_newton
 from arena_newton.eval.certification import jobs
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import agreement
@@ -56,6 +58,18 @@ def test_a_broken_process_is_named_and_the_others_go_on(tmp_path, monkeypatch):
     assert len(log.read_text().splitlines()) == 2
     left = "twist2 sonic: left to the end: error: broken"
     assert said == [f"solvable swap {task} {left}" for task in ("boxing", "football")]
+
+
+def test_a_process_runs_the_code_that_started_it(tmp_path, monkeypatch):
+    """A package of this one's name in the folder of the call is not what a certification's processes play."""
+    python, log = sys.executable, stand_in(tmp_path, monkeypatch)
+    found = "-c 'import arena_newton; print(arena_newton.__file__)'"
+    (tmp_path / "python").write_text(f'#!/bin/sh\n[ "$1" = -P ] && p=-P\n{python} $p {found} >> {log}\n')
+    (tmp_path / "arena_newton").mkdir()
+    (tmp_path / "arena_newton" / "__init__.py").touch()
+    monkeypatch.chdir(tmp_path)
+    jobs.play_ahead(CertifyOptions(out="x", jobs=1, quick=True), ["boxing"], ["swap"], lambda text: None)
+    assert log.read_text().splitlines() == [arena_newton.__file__]
 
 
 def test_a_quick_process_plays_all_checks_of_a_task(tmp_path, monkeypatch):

@@ -392,6 +392,7 @@ def shared_env():
         ({"max_episode_steps": 0}, "max_episode_steps 0"),
         ({"cameras": {"front": "nose"}, "image_size": (32, 32)}, "nose"),
         ({"cameras": {"front": CameraConfig(depth=True)}, "image_size": (32, 32)}, "front: depth"),
+        ({"cameras": {"front": CameraConfig(0, 32)}, "image_size": (32, 32)}, r"cameras: front \[0, 32\]: expected"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

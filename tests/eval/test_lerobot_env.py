@@ -188,6 +188,8 @@ def test_its_flags_are_ours():
         ({"task": "golf"}, "golf"),
         ({"task": None}, "--env.task"),
         ({"cameras": "nose"}, "--env.cameras nose"),
+        ({"image_width": 0}, "--env.image_width 0: expected at least 1"),
+        ({"image_height": -5}, "--env.image_height -5: expected at least 1"),
         ({"fps": 30}, "--env.fps 30"),
         ({"max_parallel_tasks": 2}, "--env.max_parallel_tasks 2"),
     ],

@@ -118,9 +118,9 @@ def here(monkeypatch, kept_worlds):
     codes = []
 
     def call(command, *, stdout, **_):
-        assert command[:3] == [sys.executable, "-m", "arena_newton.eval"]
+        assert command[:4] == [sys.executable, "-P", "-m", "arena_newton.eval"]
         with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
-            codes.append(main(command[3:], Factories(env=kept_worlds)))
+            codes.append(main(command[4:], Factories(env=kept_worlds)))
         return SimpleNamespace(returncode=codes[-1])
 
     monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
@@ -143,7 +143,7 @@ def test_our_runner_alone(checkpoint, tmp_path, here):
     """One protocol alone: what its program did is read from its files."""
     flags = ["--checkpoint", str(checkpoint), "--task", "boxing", "--episodes", "1", "--max-steps", str(TICKS)]
     assert main(["protocols", *flags, "--protocols", "lerobot", "--out", str(tmp_path / "out")]) == 0
-    (row,) = json.loads((tmp_path / "out" / "protocols.json").read_text())["doors"]
+    (row,) = json.loads((tmp_path / "out" / "protocols.json").read_text())["protocols"]
     assert row["steps"] == [TICKS] and row["episodes"] == len(here) == 1 and row["promised"]
 
 
@@ -270,7 +270,7 @@ def test_every_protocol_gives_the_same_episodes(checkpoint, tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.count("| `") == len(protocols) and "what is promised holds" in said and "differ |" not in said
     written = json.loads((tmp_path / "out" / "protocols.json").read_text())
-    assert [row["door"] for row in written["doors"]] == protocols
-    assert all(row["same_everything"] and row["steps"] == [TICKS, TICKS] for row in written["doors"])
+    assert [row["protocol"] for row in written["protocols"]] == protocols
+    assert all(row["same_everything"] and row["steps"] == [TICKS, TICKS] for row in written["protocols"])
     text = (tmp_path / "out" / "protocols.md").read_text()
     assert "lerobot.scripts.lerobot_eval" in text and text.count("policies.serve") == 4

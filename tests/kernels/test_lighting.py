@@ -5,7 +5,8 @@ import pytest
 
 wp = pytest.importorskip("warp")
 
-from arena_newton.kernels.pictures import lighting, shadow  # noqa: E402
+from arena_newton.data.recording.image_statistics import VALUES, add_picture  # noqa: E402
+from arena_newton.kernels.pictures import histogram, lighting, shadow  # noqa: E402
 
 EXPOSURE, BOUNCE, AMBIENT, DIRECT = 1.0 / 1700.0, 0.45, 0.2, 0.5
 
@@ -108,3 +109,18 @@ def test_masked_view_keeps_its_picture():
             image=image,
         )
         assert (image.numpy() == expected).all()
+
+
+def test_histograms_count_every_pixel_of_chosen_worlds():
+    """Noise and flat pictures are counted as OpenCV counts them, added up over ticks; worlds that do not act stay."""
+    draw = np.random.default_rng(0)
+    counted = np.array([True, False, True])
+    found, expected = wp.zeros((3, 3, VALUES), dtype=wp.int64, device="cpu"), np.zeros((3, 3, VALUES), np.int64)
+    for _ in range(2):
+        pictures = draw.integers(0, 256, (3, 6, 11, 3), np.uint8)
+        pictures[0, :4] = 7
+        for world in np.flatnonzero(counted):
+            add_picture(expected[world], pictures[world])
+        at = wp.array(pictures, dtype=wp.uint8, device="cpu"), wp.array(counted, dtype=wp.bool, device="cpu")
+        histogram.launch_histogram(*at, found)
+    assert np.array_equal(found.numpy(), expected)

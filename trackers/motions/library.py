@@ -83,7 +83,7 @@ class MotionLibrary:
     support_kind: np.ndarray = _array(np.int64, "clips")
     """Index into `SUPPORTS` of what the clip stands or sits on in addition to the floor, int64, shape [clips]."""
     support_box: np.ndarray = _array(np.float32, "clips", 7)
-    """That support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
+    """Support: centre x, y, z of its top face [m], yaw [rad], length along x and width along y [m], height of the
     top above the floor [m]; float32, shape [clips, 7]."""
     family_names: np.ndarray = _array(np.str_, "families")
     """Names of the kinds of motion, str, shape [families]."""

@@ -50,7 +50,7 @@ class ClipMeasures:
     beyond_limits: float
     """Largest angle of a joint outside its range [rad]."""
     beyond_limits_joint: str
-    """That joint; empty without one."""
+    """Name of the joint; empty without one."""
     jumps: int
     """Ticks in which root or joints move faster than the robot can."""
     slip: float

@@ -44,7 +44,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, start=1):
         try:
             rows.append(json.loads(line))
-        except ValueError:
+        except (ValueError, RecursionError):
             if number < len(lines):
                 raise InputError(f"curves {path}: line {number} is not JSON") from None
     needed = ("seconds", *(name for name, _, _ in PANELS))

@@ -102,7 +102,7 @@ def _figures(path: Path, interface: str) -> dict[str, Any]:
         measured = next(t for t in document["trackers"] if t["name"] == interface)
         figures = [{key: str(f[key]) for key in ("name", "bar", "value", "verdict")} for f in measured["figures"]]
         settings = dict(document["options"])
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"--metrics {path}: not a readable JSON file ({type(error).__name__})") from error
     except StopIteration:
         raise InputError(f"--metrics {path}: an evaluation of other trackers than {interface}") from None

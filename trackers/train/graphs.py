@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from arena_newton.trackers.train.tally import TrainingError
+from arena_newton.trackers.train.terms.measurement import TrainingError
 
 __all__ = ["captured"]
 

@@ -7,7 +7,6 @@ import dataclasses
 import importlib.util
 import io
 import os
-import shlex
 import statistics
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from arena_newton.cli.flags import shell_command
 from arena_newton.errors import InputError, naming
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
@@ -107,7 +107,7 @@ def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, proces
     sources = sorted({str(source) for source in library.source})
     return Card(
         tracker=options.tracker,
-        command="python -m arena_newton.trackers.train " + shlex.join(sys.argv[1:]),
+        command=shell_command("arena_newton.trackers.train", *sys.argv[1:]),
         commit=_commit(options.commit),
         processes=processes,
         worlds=options.worlds,

@@ -6,15 +6,10 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from arena_newton.errors import ArenaError
 from arena_newton.robot.g1 import TICK
-from arena_newton.trackers.train.terms.measurement import TickMeasurement
+from arena_newton.trackers.train.terms.measurement import TickMeasurement, TrainingError
 
-__all__ = ["ERRORS", "Tally", "TrainingError"]
-
-
-class TrainingError(ArenaError):
-    """Training cannot continue."""
+__all__ = ["ERRORS", "Tally"]
 
 
 def _rms(difference: torch.Tensor) -> torch.Tensor:

@@ -19,10 +19,12 @@ from arena_newton.data.recording.encoder_pool import EncoderPool
 from arena_newton.data.recording.encoding import EncoderThreads, Pictured, VideoEncoder, VideoStream
 from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
 from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
+from arena_newton.data.recording.image_statistics import VALUES
 from arena_newton.data.recording.look_planes import LookPlanes
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
+from arena_newton.kernels.pictures.histogram import launch_histogram
 from arena_newton.pictures.camera import Camera
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, HAND_CLOSED, STATE
@@ -107,6 +109,8 @@ class _Stream:
     """Its films by camera, and that of its looks."""
     looks: Looks | None = None
     heading: float = 0.0
+    histograms: dict[str, np.ndarray] = field(default_factory=dict)
+    """Pixels of the pictures of each camera by channel and value, int64, shape [3, 256]; when it has ended."""
     rows: list[np.ndarray] = field(default_factory=list)
     """Packed rows: the beginning of a tick, then what was executed in it."""
 
@@ -173,6 +177,8 @@ class DemonstrationRecorder(Recorder):
         """The films of the worlds that act, by camera."""
         self._chosen: torch.Tensor | None = None
         """The worlds that act, where not all do."""
+        self._histograms: dict[str, wp.array] = {}
+        """Pixels of each world's pictures by camera, int64, shape [worlds, 3, 256]."""
         self._before: torch.Tensor | None = None
         self._encoder: VideoEncoder = (
             EncoderPool(processes, threads) if processes and self.cameras else EncoderThreads(threads)
@@ -195,6 +201,9 @@ class DemonstrationRecorder(Recorder):
         # Surfaces of worlds that a second render of a tick leaves out are not kept: then the cameras are two.
         self._shared = set() if self.depth or self.looks else same
         self._views = {name: self._view(env, name, config) for name, config in self.cameras.items()}
+        with wp.ScopedDevice(env.scene.device):
+            self._counted = wp.zeros(env.worlds, dtype=wp.bool)
+            self._histograms = {name: wp.zeros((env.worlds, 3, VALUES), dtype=wp.int64) for name in self._views}
         pictured = {name: Pictured(env.worlds, c.height, c.width, self.depth) for name, c in self._views.items()}
         if self.looks:
             self._planes = LookPlanes(env, self._views["front"], self.looks)
@@ -233,6 +242,8 @@ class DemonstrationRecorder(Recorder):
     def start(self, env: World, world: int, episode: RecordedEpisode) -> None:
         """An episode without rows yet."""
         self._bind(env)
+        for histogram in self._histograms.values():
+            wp.to_torch(histogram)[world] = 0
         initial = {}
         for name, body in self._bodies.items():
             initial[f"episode_init_env_obj_{name}_position"] = self._xpos[world, body].cpu().numpy().copy()
@@ -286,6 +297,10 @@ class DemonstrationRecorder(Recorder):
         self._acting = worlds
         self._videos = {name: [self._streams[world].videos[name] for world in worlds] for name in self.cameras}
         self._chosen = None
+        if self.cameras:
+            acting: np.ndarray = np.zeros(self._counted.shape, bool)
+            acting[worlds] = True
+            self._counted.assign(acting)
 
     def _film(self, env: World, name: str, camera: Camera, mask: np.ndarray, observation: Observation) -> None:
         """Render a camera and hand the pictures to whoever makes the films."""
@@ -294,6 +309,7 @@ class DemonstrationRecorder(Recorder):
             missing = mask & ~observation.mask
         if missing.any():
             env.render(camera, missing)
+        launch_histogram(camera.image, self._counted, self._histograms[name])
         pictures = self._taken(wp.to_torch(camera.image))
         depths = self._taken(camera.distance_picture()).half() if self.depth else None
         self._encoder.add(name, self._videos[name], pictures, depths)
@@ -341,6 +357,8 @@ class DemonstrationRecorder(Recorder):
         wanted = result.outcome == "success" or (not self.only_success and result.outcome != "error")
         if wanted and stream.rows:
             last = self._qpos[world].cpu().numpy().copy()
+            counts = {name: wp.to_torch(histogram)[world] for name, histogram in self._histograms.items()}
+            stream.histograms = {name: count.cpu().numpy().copy() for name, count in counts.items()}
             fields = partial(self._fields, env, stream, result, last, self._described)
             self._encoder.finish(stream.worker, stream.videos, partial(self._save, stream, result, fields))
         else:
@@ -466,7 +484,7 @@ class DemonstrationRecorder(Recorder):
             fields[f"arena_{vision('front', 'looks')}"] = np.str_(json.dumps(looks.plain()))
         for name in self.cameras:
             if (film := films[name]) is not None:
-                fields |= _film_fields(name, stream.videos[name], film, rows)
+                fields |= _film_fields(name, stream, film, rows)
         fields |= {
             "arena_state": state,
             "arena_action": action,
@@ -518,28 +536,29 @@ class DemonstrationRecorder(Recorder):
         self.close()
 
 
-def _film_fields(name: str, stream: VideoStream, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
+def _film_fields(name: str, stream: _Stream, film: FilmFacts, rows: int) -> dict[str, np.ndarray | np.generic]:
     """Fields of a camera's film in the file.
 
     Raises:
         ArenaError: The film has another number of pictures.
     """
-    _check_frames(stream, film, rows)
+    video = stream.videos[name]
+    _check_frames(video, film, rows)
     codec = {"vcodec": "h264", "g": key_frames(film.height), "crf": CRF, "preset": "veryfast", "bf": 0, "mbtree": 0}
     found: dict[str, np.ndarray | np.generic] = {
         vision(name, "storage_format"): np.str_("video_v1"),
         vision(name, "frame_indices"): np.arange(rows),
-        vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{stream.video.name}"),
+        vision(name, "rgb_video_path"): np.str_(f"{VIDEO_FOLDER}/{video.video.name}"),
         vision(name, "rgb_video_fps"): np.float64(FPS),
         vision(name, "rgb_video_num_frames"): np.int64(film.frames),
     }
     if film.depth_shape:
         shape = (rows, *film.depth_shape)
-        found[vision(name, "depth")] = np.memmap(stream.depth, np.float16, "r", shape=shape)
+        found[vision(name, "depth")] = np.memmap(video.depth, np.float16, "r", shape=shape)
     return found | {
         f"arena_{vision(name, 'size')}": np.array([film.width, film.height]),
         f"arena_{vision(name, 'codec')}": np.str_(json.dumps(codec)),
-        f"arena_{vision(name, 'histogram')}": film.histogram,
+        f"arena_{vision(name, 'histogram')}": stream.histograms[name],
     }
 
 

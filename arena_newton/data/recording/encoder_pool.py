@@ -366,6 +366,6 @@ class EncoderPool(VideoEncoder):
 def _facts(plain: object) -> FilmFacts | None:
     """Facts as a process tells them."""
     match plain:
-        case {"width": int(width), "height": int(height), "frames": int(frames), "histogram": counts, "depth_shape": d}:
-            return FilmFacts(width, height, frames, np.array(counts, np.int64), tuple(d))
+        case {"width": int(width), "height": int(height), "frames": int(frames), "depth_shape": depth}:
+            return FilmFacts(width, height, frames, tuple(depth))
     return None

@@ -21,7 +21,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from arena_newton.data.recording.episode_film import Film, FilmFacts
+from arena_newton.data.recording.episode_film import Film
 
 __all__ = ["SlotMemory", "main", "packed", "unpacked"]
 
@@ -156,7 +156,7 @@ class _Films:
             self._broken(number, error)
             facts, film = None, None
         self._films.pop(number, None)
-        self._answer({"closed": number, "whole": film is not None, "facts": None if facts is None else _plain(facts)})
+        self._answer({"closed": number, "whole": film is not None, "facts": facts and vars(facts)})
 
     def _broken(self, number: int, error: Exception) -> None:
         """Say why a film cannot be written, and drop it."""
@@ -176,11 +176,6 @@ class _Films:
                 self._end_with_parent()
             except ConnectionError:  # the next message says how the recorder ended
                 return
-
-
-def _plain(facts: FilmFacts) -> dict[str, object]:
-    """Facts as JSON."""
-    return vars(facts) | {"histogram": facts.histogram.tolist()}
 
 
 def main(descriptor: str, parent: str) -> None:

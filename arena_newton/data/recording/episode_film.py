@@ -1,4 +1,4 @@
-"""The film of one camera and episode while it is made: the MP4, what its pictures hold, and their depths.
+"""The film of one camera and episode while it is made: the MP4, and the depths of its pictures.
 
 Nothing here needs torch, so that a process that encodes pictures starts at once.
 """
@@ -12,7 +12,6 @@ from typing import BinaryIO
 
 import numpy as np
 
-from arena_newton.data.recording.image_statistics import VALUES, add_picture
 from arena_newton.files.untrusted_files import create
 from arena_newton.pictures.video import VideoWriter
 
@@ -41,8 +40,6 @@ class FilmFacts:
     """[px]."""
     frames: int
     """Number of pictures."""
-    histogram: np.ndarray
-    """Pixels of all pictures by channel and value, int64, shape [3, 256]."""
     depth_shape: tuple[int, ...]
     """Shape of a picture's depth, [H, W]; empty where none was recorded."""
 
@@ -62,7 +59,6 @@ class Film:
         self.video, self.depth, self.fps = video, depth, fps
         self._how: dict[str, bool] = {"b_frames": False, "sync": True, "lossless": lossless}
         self._writer: VideoWriter | None = None
-        self._histogram = np.zeros((3, VALUES), np.int64)
         self._depth_file: BinaryIO | None = None
         self._depth_shape: tuple[int, ...] = ()
 
@@ -77,7 +73,6 @@ class Film:
             gop = key_frames(height)
             self._writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, **self._how)
         self._writer.write(picture)
-        add_picture(self._histogram, picture)
         if depth is not None:
             if self._depth_file is None:
                 self._depth_file, self._depth_shape = create(self.depth), depth.shape
@@ -101,7 +96,7 @@ class Film:
             except OSError as error:
                 raise OSError(error.errno, error.strerror, str(self.depth)) from None
         writer = self._writer
-        return FilmFacts(writer.width, writer.height, writer.frames, self._histogram, self._depth_shape)
+        return FilmFacts(writer.width, writer.height, writer.frames, self._depth_shape)
 
     def discard(self) -> None:
         """Remove what was written."""

@@ -156,6 +156,9 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
         """Cameras by their names in datasets: the policy's, with what the flags change."""
         names = tuple(declared.cameras) if self.cameras is None else _names(self.cameras)
         usual = next(iter(declared.cameras.values()))
+        for flag, pixels in (("image_width", self.image_width), ("image_height", self.image_height)):
+            if pixels is not None and pixels < 1:
+                raise InputError(f"--env.{flag} {pixels}: expected at least 1 [px]")
         found = {}
         for name in names:
             if name not in CAMERAS:

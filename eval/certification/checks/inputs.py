@@ -59,7 +59,7 @@ class Collector(Policy):
 
 
 def policy_inputs(context: Context) -> CheckFinding:
-    """Give a policy its episodes by the doors of a run, and draw placements from each number that it was given."""
+    """Give a policy its episodes as a run does, and draw placements from each number that it was given."""
     rows, wrong = [], []
     tracker = context.trackers[0]
     for task in context.tasks[:1] if context.options.quick else context.tasks:

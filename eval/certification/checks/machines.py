@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import cast
 
 from arena_newton.cli.extras import require
+from arena_newton.cli.flags import words
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.checks.same_files import contents, digest
 from arena_newton.eval.certification.context import Context
@@ -211,16 +212,12 @@ def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:
         plan: What to play.
         folder: New results folder; what the run says is written next to it.
     """
-    flags = ["run", "--task", *plan.task, "--tracker", *plan.tracker, "--policy", plan.policy, "--mode", *plan.mode]
-    flags += ["--seeds", *map(str, plan.seeds), "--repeats", str(plan.repeats), "--engine", plan.engine]
-    flags += ["--device", plan.device] if plan.device is not None else []
-    flags += ["--worlds", str(RAY_WORLDS), "--out", str(folder)]
-    flags += ["--ray", "--ray-cpus", "1", "--ray-actors", str(ACTORS)]
+    cluster = replace(plan, ray=(), ray_cpus=1, ray_actors=ACTORS, worlds=RAY_WORLDS, out=str(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     log, code = folder.with_suffix(".log"), None
     with open(log, "wb") as output:
         process = subprocess.Popen(
-            [*COMMAND, *flags], env=environment(), stdout=output, stderr=output, start_new_session=True
+            [*COMMAND, "run", *words(cluster)], env=environment(), stdout=output, stderr=output, start_new_session=True
         )
         try:
             killed_after = _kill_one(process, folder)

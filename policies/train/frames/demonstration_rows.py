@@ -17,7 +17,7 @@ from arena_newton.data.readers.label_protocols import LABELS, action_names, enco
 from arena_newton.data.readers.lerobot_reader import DatasetActions
 from arena_newton.data.readers.looks import LOOKS_FOLDER
 from arena_newton.errors import InputError
-from arena_newton.pictures.settings import FRONT
+from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 __all__ = [
@@ -134,7 +134,8 @@ def read_rows(root: Path, labels: str, cameras: Sequence[str] = (FRONT,)) -> Dat
         raise InputError(f"{where}: features: has no pictures, which a policy is to see")
     features = {name: PICTURES + name for name in cameras}
     if FRONT in features and CAMERA_KEY not in keys:
-        features[FRONT] = keys[0]
+        foreign = (key for key in keys if key.removeprefix(PICTURES) not in CAMERAS)
+        features[FRONT] = next(foreign, CAMERA_KEY)
     shape: list[int] = []
     for name, key in features.items():
         if key not in keys:

@@ -68,6 +68,13 @@ def test_what_differs_is_refused(protocol, other, text):
     assert text in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("cameras", [{}, {"nose": {}}, {"front": {"width": 4}}, ["front"]])
+def test_unfit_cameras_of_a_handshake(cameras):
+    """A declaration of cameras that no robot can send is refused with the cameras that are known."""
+    with pytest.raises(WireError, match=r"declares: cameras is .*, expected width, height .* of front, left_wrist"):
+        read_facts({"arena": 1, "cameras": cameras}, "server")
+
+
 @pytest.mark.parametrize("protocol", ["http", "openpi", "vla-eval", "gr00t"])
 def test_a_server_that_repeats_the_token(protocol, monkeypatch):
     """Declarations hold no token in results or messages, also of a server that repeats what it was sent."""

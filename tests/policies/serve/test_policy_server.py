@@ -284,7 +284,8 @@ def test_pictures_are_fitted(made):
 @pytest.mark.parametrize(
     ("name", "camera", "said"),
     [
-        ("rear", CameraConfig(prim="/World/Rear"), "camera rear"),
+        ("rear", CameraConfig(prim="/World/Rear"), "camera /World/Rear as rear"),
+        ("front", CameraConfig(prim="left_wrist"), "camera left_wrist as front"),
         ("front", CameraConfig(depth=True), "the depth of front"),
     ],
 )

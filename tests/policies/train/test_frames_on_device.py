@@ -80,6 +80,9 @@ def test_pictures_of_several_cameras(tmp_path):
     assert not torch.equal(*shown.values()) and "observation.images.left_wrist" not in batch
     with pytest.raises(InputError, match=r"--cameras world: .*info.json has no observation.images.world, but"):
         loaded(("front", "world"))
+    wrists = make_dataset(tmp_path / "wrists", cameras=("left_wrist",))
+    with pytest.raises(InputError, match=r"--cameras front: .* has no observation.images.front, but .*left_wrist"):
+        read_rows(wrists, "v4")
 
 
 def test_the_first_episodes_alone(rows, store):

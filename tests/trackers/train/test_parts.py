@@ -14,9 +14,9 @@ from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import session
 from arena_newton.trackers.train.references import KEY_LINKS, ReferenceBank
 from arena_newton.trackers.train.sampling import ClipSampler
-from arena_newton.trackers.train.tally import Tally, TrainingError
+from arena_newton.trackers.train.tally import Tally
 from arena_newton.trackers.train.terms import events
-from arena_newton.trackers.train.terms.measurement import TickMeasurement
+from arena_newton.trackers.train.terms.measurement import TickMeasurement, TrainingError
 from arena_newton.trackers.train.terms.rewards import REWARDS, configured, maximum
 from arena_newton.trackers.train.terms.terminations import TERMINATIONS
 

@@ -25,9 +25,9 @@ from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.export import export
 from arena_newton.trackers.train.runner import TrackerRunner, annealed
 from arena_newton.trackers.train.simulation import share_stream
-from arena_newton.trackers.train.tally import TrainingError
 from arena_newton.trackers.train.terms import events
 from arena_newton.trackers.train.terms.critic import CRITIC
+from arena_newton.trackers.train.terms.measurement import TrainingError
 from arena_newton.trackers.train.terms.rewards import Term
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import ExportOptions, TrainOptions, check
@@ -278,6 +278,7 @@ def test_export_takes_fitting_figures_only(trained, tmp_path):
         ('{"trackers": [{}]}', "not an evaluation.json"),
         (json.dumps(document), "other trackers than twist2"),
         ("{", "not a readable JSON file"),
+        ("[" * 100_000, "not a readable JSON file"),
     ):
         metrics.write_text(text)
         with pytest.raises(InputError, match=words):
@@ -483,10 +484,12 @@ def test_curves(trained, tmp_path, capsys):
     with Image.open(out) as picture:
         assert picture.width > 1000 and len(set(picture.convert("L").resize((60, 30)).getdata())) > 10
     (tmp_path / "bad.jsonl").write_text("3\n{}\n")
+    (tmp_path / "deep.jsonl").write_text("[" * 100_000 + "\n{}\n")
     for arguments, words in (
         (["curves", str(tmp_path / "b")], "b/progress.jsonl: cannot be read"),
         (["curves"], "name the folders"),
         (["curves", str(tmp_path / "bad.jsonl")], "a logged iteration lacks seconds"),
+        (["curves", str(tmp_path / "deep.jsonl")], "deep.jsonl: line 1 is not JSON"),
         (["curves", log, "--out", str(tmp_path / "a.txt")], "expected .png"),
     ):
         assert command_line.main(arguments) == 2

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.trackers.train.tally import TrainingError
-from arena_newton.trackers.train.terms.measurement import TickMeasurement
+from arena_newton.trackers.train.terms.measurement import TickMeasurement, TrainingError
 
 if TYPE_CHECKING:
     from arena_newton.trackers.train.tracker_env import TrackerEnv

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from arena_newton.errors import ArenaError
 from arena_newton.robot import rotations
 from arena_newton.robot.rotations import atan2
 from arena_newton.trackers.train.references import Frame
@@ -15,7 +16,11 @@ from arena_newton.trackers.train.references import Frame
 if TYPE_CHECKING:
     from arena_newton.trackers.train.simulation import Simulation
 
-__all__ = ["TickMeasurement"]
+__all__ = ["TickMeasurement", "TrainingError"]
+
+
+class TrainingError(ArenaError):
+    """Training cannot continue."""
 
 
 @dataclass
