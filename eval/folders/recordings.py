@@ -37,7 +37,8 @@ def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: in
         StorageError: The file cannot be written.
     """
     try:
-        with replace_atomically(path) as file:
+        # A process that was given up for dead may still play the episode.
+        with replace_atomically(path, shared=True) as file:
             np.savez_compressed(
                 file,
                 action=np.stack(actions),

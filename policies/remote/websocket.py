@@ -154,6 +154,8 @@ class SocketLink(ServerLink[SocketRequest, object]):
             if isinstance(error.__cause__, EOFError):
                 raise AskAgain("the connection was closed before it was open") from error
             raise ValueError(f"no websocket ({cause(error)})") from error
+        except ConnectionClosed as error:  # while the opening request was sent
+            raise AskAgain("the connection was closed before it was open") from error
         try:
             return self.greet(end)
         except Exception:  # without its greeting a connection is of no use

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.folders.recordings import ActionRecorder
+from arena_newton.eval.folders.recordings import ActionRecorder, write_actions
 from arena_newton.eval.play.run import Factories
 from arena_newton.files.own_files import PARTIAL
 from arena_newton.interfaces import Observation
@@ -163,3 +164,16 @@ def test_recordings_follow_no_link(tmp_path):
     assert victim.read_text() == "mine" and not path.is_symlink() and path.name == "boxing_base_s0_r0.npz"
     with np.load(path) as arrays:
         assert arrays["action"].shape == (3, 40)
+
+
+def test_actions_may_be_written_by_two_at_once(tmp_path):
+    """A process that was given up for dead writes what its successor writes: neither fails, and the file is whole."""
+    path, actions = tmp_path / "actions" / "a.npz", [np.zeros(40, np.float32)] * 50
+
+    def write(_):
+        return [write_actions(path, actions, episode_seed=1, gym_id="a", mode="base") for _ in range(20)]
+
+    with ThreadPoolExecutor(4) as pool:
+        hashes = {one for found in pool.map(write, range(4)) for one in found}
+    assert hashes == {hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert [file.name for file in path.parent.iterdir()] == ["a.npz"]

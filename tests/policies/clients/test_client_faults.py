@@ -8,9 +8,11 @@ import time
 import numpy as np
 import pytest
 from foreign_servers import Gr00tServer, HttpServer, SocketServer, asking, facts, observation
+from websockets.exceptions import ConnectionClosedError
 
 from arena_newton.errors import InputError
 from arena_newton.policies import PolicyUnavailable
+from arena_newton.policies.remote import websocket
 from arena_newton.policies.remote.address import TOKEN_VARIABLE
 from arena_newton.policies.remote.client import MAX_FAILURES
 
@@ -395,6 +397,24 @@ def test_close_breaks_off_what_waits(running):
     assert not asking.is_alive()
 
 
+def test_a_connection_that_breaks_while_it_opens_is_opened_again(monkeypatch):
+    """A server that closes a connection before its greeting is asked once more, as one that is not there yet."""
+    server, opened = SocketServer("openpi", facts()), []
+
+    def breaking(*arguments, **more):
+        opened.append(arguments)
+        if len(opened) == 1:
+            raise ConnectionClosedError(None, None)
+        return connect(*arguments, **more)
+
+    connect = websocket.connect
+    monkeypatch.setattr(websocket, "connect", breaking)
+    policy = asking(f"openpi://127.0.0.1:{server.port}", retries=1)
+    policy.check()
+    policy.close()
+    assert len(opened) == 2
+
+
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
 def test_wss(protocol, certificate):
     """A certificate that nobody vouches for is refused before the first episode, or taken on request."""
@@ -404,7 +424,7 @@ def test_wss(protocol, certificate):
     with pytest.raises(InputError, match="--remote-insecure does without"):
         policy.check()
     policy.close()
-    policy = asking(url, timeout=3.0, retries=0, verify_ssl=False)
+    policy = asking(url, timeout=3.0, retries=2, verify_ssl=False)
     policy.check()
     policy.reset([7, 8, 9], ["Isaac-Football"] * 3)
     server.behave = {1.0: "slow"}
