@@ -143,7 +143,7 @@ def test_unfit_folders_are_refused(recorded, tmp_path):
 
 
 def test_recordings_follow_no_link(tmp_path):
-    """A link that lies where a recording is written leads nowhere; its temporary name is one that nobody can foresee."""
+    """A link that lies where a recording is written leads nowhere; its temporary name cannot be foreseen."""
     victim = tmp_path / "victim"
     victim.write_text("mine")
     folder = tmp_path / "actions"
