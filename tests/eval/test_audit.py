@@ -278,7 +278,7 @@ def test_forgeries_are_found_by_lines(folder, capsys, name):
 
 @pytest.mark.parametrize("name", BY_HEAD)
 def test_forgeries_are_found_by_the_published_head(folder, capsys, name):
-    """A folder whose line, links and tables were edited agrees with itself, and not with the head that was published."""
+    """A folder whose line, links and tables were edited agrees with itself, and not with the published head."""
     published = json.loads((folder / "results.json").read_text())["head"]
     lines = lines_of(folder)
     BY_HEAD[name](folder, lines)
