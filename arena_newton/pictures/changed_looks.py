@@ -21,16 +21,8 @@ import torch
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
 
-__all__ = [
-    "SEMANTIC_COLOURS",
-    "Changes",
-    "changed_looks",
-    "hue_lacks",
-    "luminance",
-    "palette",
-    "recoloured",
-    "seen_colours",
-]
+__all__ = ["SEMANTIC_COLOURS", "Changes", "changed_looks", "hue_lacks", "luminance", "palette", "recoloured"]
+__all__ += ["seen_colours"]
 
 SEMANTIC_COLOURS = (
     (0.05, 0.85, 0.1),  # the cube on the bag

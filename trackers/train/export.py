@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.files.limits import TEXT_BYTES
 from arena_newton.files.own_files import replace_atomically
-from arena_newton.files.stored_json import Json, fit, read_object
+from arena_newton.files.stored_json import read_object
 from arena_newton.pages.tables import Table
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
@@ -16,26 +17,6 @@ from arena_newton.trackers.train.checkpoint import Checkpoint
 from arena_newton.trackers.train.train_options import ExportOptions
 
 __all__ = ["export", "write"]
-
-MAX_EVALUATION = 64 << 20
-"""Largest evaluation.json [bytes]."""
-
-
-class _Figure(TypedDict):
-    name: str
-    bar: str
-    value: str
-    verdict: str
-
-
-class _Tracker(TypedDict):
-    name: str
-    figures: list[_Figure]
-
-
-class _Evaluation(TypedDict):
-    trackers: list[_Tracker]
-    options: dict[str, Json]
 
 
 def export(checkpoint: Path, options: ExportOptions) -> Path:
@@ -118,13 +99,15 @@ def _figures(path: Path, interface: str) -> dict[str, Any]:
     Raises:
         InputError: The file is no evaluation of such a tracker.
     """
-    document = read_object(path, MAX_EVALUATION)
-    fit(f"--metrics {path}: not an evaluation.json of trackers.evaluate", document, _Evaluation)
-    measured = next((one for one in document["trackers"] if one["name"] == interface), None)
-    if measured is None:
-        raise InputError(f"--metrics {path}: an evaluation of other trackers than {interface}")
-    figures = [{key: one[key] for key in ("name", "bar", "value", "verdict")} for one in measured["figures"]]
-    settings = document["options"]
+    document = read_object(path, TEXT_BYTES)
+    try:
+        measured = next(t for t in document["trackers"] if t["name"] == interface)
+        figures = [{key: str(f[key]) for key in ("name", "bar", "value", "verdict")} for f in measured["figures"]]
+        settings = dict(document["options"])
+    except StopIteration:
+        raise InputError(f"--metrics {path}: an evaluation of other trackers than {interface}") from None
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"--metrics {path}: not an evaluation.json of trackers.evaluate") from None
     kept = ("suite", "rollouts", "seed", "engine", "device", "clips", "only")
     return {"figures": figures, "settings": {k: settings[k] for k in kept if settings.get(k) not in (None, "")}}
 
