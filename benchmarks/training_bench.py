@@ -13,8 +13,8 @@ import torch
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.own_processes import environment
+from arena_newton.physics.devices import torch_device
 from arena_newton.policies.train.policy_options import check_choices, check_ranges
-from arena_newton.policies.train.training import chosen_device
 from benchmarks.bench_options import TrainingBenchOptions
 from benchmarks.measured_training import READY, SpeedFigure, bench_recipe
 
@@ -52,7 +52,7 @@ def training_figures(options: TrainingBenchOptions) -> Iterator[BenchFigure]:
         ArenaError: A training failed, or the trainings do not fit into the device's memory.
     """
     check(options)
-    device, _ = chosen_device(options.device)
+    device = torch_device(options.device)
     settings = bench_recipe(options)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     judged = "H200" in name and settings.family == "act" and settings.batch_size == 64 and settings.name != "small"

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 __all__ = [
+    "Device",
     "Several",
     "check_least",
     "shell_command",
@@ -37,6 +38,16 @@ Several = Annotated[
     tuple[_T, ...], tyro.conf.arg(help_behavior_hint=lambda shown: f"(default: {shown})" if shown else "")
 ]
 """Values of a flag that takes at least one; help shows no default where it is none of them."""
+
+
+def _device_hint(shown: str) -> str:
+    return f"(default: {'the best there is' if shown in ('None', 'auto') else shown})"
+
+
+Device = Annotated[
+    _T, tyro.conf.arg(help="Device of simulation and networks: cpu, cuda, cuda:1.", help_behavior_hint=_device_hint)
+]
+"""Device of a command; None and `auto`: the best there is."""
 
 
 def flag_name(field: str) -> str:

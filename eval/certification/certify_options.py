@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Device, Several
 from arena_newton.eval.plan.options import Jobs
 
 __all__ = ["CertifyOptions"]
@@ -36,8 +36,7 @@ class CertifyOptions(Jobs):
     """Episodes simulated at once."""
     engine: str = "mujoco"
     """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    device: Device[str | None] = None
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
     resume: bool = False

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Device, Several
 
 __all__ = [
     "QUICK_REPEATS",
@@ -103,8 +103,7 @@ class Batch:
     """Episodes simulated at once."""
     engine: str = "auto"
     """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
+    device: Device[str | None] = None
 
 
 @dataclass(frozen=True)

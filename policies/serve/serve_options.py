@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from arena_newton.cli.flags import Device
 from arena_newton.errors import InputError
 
 __all__ = ["PROTOCOLS", "ServeOptions"]
@@ -33,8 +34,7 @@ class ServeOptions:
     """Longest wait of a batch's first query for others [s]."""
     max_sessions: int = 64
     """Most episodes at once: rows of the policy. Eight connections more are taken."""
-    device: str | None = None
-    """Torch device of the policy: cpu, cuda, cuda:1; the best there is when none is named."""
+    device: Device[str | None] = None
     task: str | None = None
     """Task of the query before the first one, by which everything is loaded and compiled; one that the policy does when
     none is named."""

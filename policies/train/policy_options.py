@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import Several, flag_name
+from arena_newton.cli.flags import Device, Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
@@ -44,7 +44,7 @@ def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PolicyTrainOptions:
-    """Train a policy on datasets of demonstrations."""
+    """Train a policy on datasets of demonstrations; with torchrun each process takes a GPU of its own."""
 
     policy: str = "act"
     """Family: act, diffusion, flow or pi05."""
@@ -87,8 +87,7 @@ class PolicyTrainOptions:
     """Learning rate after the warm-up; 0: the recipe's."""
     seed: int | None = field(default=None, metadata=bounds(0, 2**31))
     """Of weights, order, augmentation and noise; the recipe's by default."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N or auto; with torchrun each process takes a GPU of its own."""
+    device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
     save_every: int = field(default=5000, metadata=bounds(0))
@@ -143,8 +142,7 @@ class TeachableOptions:
     """Cap on the step budget of the task [ticks of 0.02 s]."""
     engine: str = "mujoco"
     """Physics engine: mujoco, warp or auto."""
-    device: str = "cpu"
-    """Device of the worlds: cpu, cuda, cuda:N."""
+    device: Device[str] = "cpu"
     out: Path | None = None
     """Write the result to this JSON file."""
 

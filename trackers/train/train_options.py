@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from arena_newton.cli.flags import Several, flag_name
+from arena_newton.cli.flags import Device, Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.trackers.interface import names
 
@@ -55,14 +55,13 @@ def at_least(low: float) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Train a tracker with PPO in the lab world."""
+    """Train a tracker with PPO in the lab world; with torchrun each process takes a GPU of its own."""
 
     tracker: TrackerName = "twist2"
     """Interface to train."""
     worlds: int = field(default=0, metadata=at_least(0))
     """Parallel worlds of each process, 0 = 8192 on a GPU, 16 on a CPU."""
-    device: str = "auto"
-    """cpu, cuda or cuda:N; with torchrun each process takes its own GPU."""
+    device: Device[str] = "auto"
     minutes: float = field(default=0.0, metadata=at_least(0))
     """Time limit [min], 0 = none."""
     iterations: int = field(default=100000, metadata=at_least(1))
