@@ -38,8 +38,8 @@ INNER = {
     PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets
         | pictures | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
-    f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
-        | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
+    f"{PACKAGE}.policies": """chunk_flags recipes | base | label_reader open_loop stand serve_example | protocols
+        | replay_dataset | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
     f"{PACKAGE}.policies.train": """frames network_memory policy_options teachable_network training_log
         | checkpoint_packing families stored_flags teachable | network_compiler | policy_trainer | training_state
         | training_loop | training | training_check __main__""",

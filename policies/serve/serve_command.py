@@ -98,12 +98,8 @@ def make_policy(options: ServeOptions, device: torch.device) -> Policy:
     Raises:
         InputError: There is no such policy, or it is of other labels than it is said to be.
     """
-    more: dict[str, object] = {}
-    if options.policy.partition(":")[0] == "lerobot":
-        more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
-    elif options.replan is not None or options.ensemble:
-        raise InputError("--replan and --ensemble: of a checkpoint only, --policy lerobot:<checkpoint>")
-    policy = get(options.policy, **{name: value for name, value in more.items() if value is not None})
+    more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
+    policy = get(options.policy, **more if options.policy.partition(":")[0] == "lerobot" else {})
     labels = options.labels or getattr(policy, "labels", None) or "v3.1"
     decoded = read_by(policy, labels)
     if not options.raw_labels:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from arena_newton.cli.flags import Device
 from arena_newton.errors import InputError
+from arena_newton.policies.chunk_flags import ChunkFlags
 
 __all__ = ["PROTOCOLS", "ServeOptions"]
 
@@ -17,8 +18,8 @@ MOST_SESSIONS = 4096
 
 
 @dataclass(frozen=True)
-class ServeOptions:
-    """Options of a policy server."""
+class _Served:
+    """Policy, and who may ask it."""
 
     policy: str = ""
     """Policy: stand, learned, lerobot:<checkpoint>, replay:<file>, another package's, or remote:<url> to pass on."""
@@ -40,12 +41,12 @@ class ServeOptions:
     none is named."""
     tracker: str = ""
     """Tracker of the robots, for a policy that is given its name; unknown by default: no protocol says it."""
-    replan: int | None = None
-    """Actions of a chunk that are executed before the next query, of a checkpoint; its own number by default."""
-    ensemble: bool = False
-    """Average the chunks that cover a tick, of a checkpoint."""
-    labels: str | None = None
-    """Label protocol of the policy's actions, v3.1 or v4, where it does not say so itself."""
+
+
+@dataclass(frozen=True)
+class ServeOptions(ChunkFlags, _Served):
+    """Let a policy answer over the network."""
+
     raw_labels: bool = False
     """Give actions of v4 as they are and declare them so; otherwise they are decoded to v3.1."""
     tls_cert: str | None = None
@@ -73,7 +74,6 @@ class ServeOptions:
             raise InputError(f"--max-batch-size {self.max_batch_size}: expected 1 to {MOST_SESSIONS}")
         if not (math.isfinite(self.max_wait) and 0.0 <= self.max_wait <= 60.0):
             raise InputError(f"--max-wait {self.max_wait:g}: expected seconds from 0 to 60")
-        if self.replan is not None and self.replan < 1:
-            raise InputError(f"--replan {self.replan}: expected at least 1")
+        self.check_chunks(self.policy)
         if (self.tls_cert is None) != (self.tls_key is None):
             raise InputError("--tls-cert and --tls-key: name both or none")

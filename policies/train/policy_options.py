@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from arena_newton.cli.flags import Device, Several, flag_name
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CAMERAS, FRONT
+from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
 if TYPE_CHECKING:
@@ -245,8 +246,8 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if options.steps and options.minutes:
         raise InputError("--steps: is given by --minutes too; drop one of them")
-    if options.labels not in ("", "v3.1", "v4"):
-        raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    if options.labels not in ("", *LABELS):
+        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)
     named = {*options.cameras}
     if not named or len(named) < len(options.cameras) or named - {*ROBOT_CAMERAS}:

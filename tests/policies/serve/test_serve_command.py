@@ -43,7 +43,7 @@ from tests.children import Child
         (["--policy", "stand", "--max-wait", "-1"], "--max-wait -1: expected seconds"),
         (["--policy", "stand", "--max-wait", "nan"], "--max-wait nan: expected seconds"),
         (["--policy", "stand", "--replan", "0"], "--replan 0: expected at least 1"),
-        (["--policy", "stand", "--replan", "5", "--port", "0"], "--replan and --ensemble: of a checkpoint only"),
+        (["--policy", "stand", "--replan", "5", "--port", "0"], "--replan: belongs to --policy lerobot:"),
         (["--policy", "stand", "--tls-cert", "a.pem"], "--tls-cert and --tls-key: name both or none"),
         (
             ["--policy", "stand", "--tls-cert", "a.pem", "--tls-key", "b.pem", "--port", "0"],
