@@ -45,6 +45,8 @@ INNER = {
         | training_loop | training | training_check __main__""",
     f"{PACKAGE}.trackers": """interface motions | base | inference | front_end
         | evaluation pd sonic tracker_check train twist2 | evaluate __main__""",
+    f"{PACKAGE}.trackers.train": """checkpoint curves model references train_options | export logger sampling simulation
+        | terms | graphs tally | ppo tracker_env | runner | session | __main__""",
 }
 """Folder → its rooms and single modules from the bottom to the top: each imports from those before it. Imports for type
 checkers count here."""
@@ -52,6 +54,7 @@ NAMES_ABOVE = {
     f"{PACKAGE}.interfaces": "protocols name the types that they connect",
     f"{PACKAGE}.trackers.interface": "an interface names the front end and the network that it stands for",
     f"{PACKAGE}.tasks": "a judge is handed the scene and the physics that it reads",
+    f"{PACKAGE}.trackers.train.terms": "a term is handed the worlds of the training that it reads",
 }
 """Rooms whose imports for type checkers may name what stands above them, and why."""
 FRONT_DOOR = f"{PACKAGE}.__main__"
