@@ -95,7 +95,8 @@ def _run(arguments: list[str]) -> int:
     if found:
         command = max(found, key=lambda c: len(c.words))
         rest = arguments[len(command.words.split()) :]
-        return importlib.import_module(command.module).main(rest)
+        code: int = importlib.import_module(command.module).main(rest)
+        return code
     wants_help = bool(arguments) and arguments[-1] in ("-h", "--help")
     group = " ".join(arguments[:-1] if wants_help else arguments)
     if group and not any(c.words.startswith(f"{group} ") for c in COMMANDS):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arena_newton.cli.flags import Device, Several
-from arena_newton.policies.train.policy_options import bounds
+from arena_newton.cli.flags import Device, Several, bounds
 
 __all__ = [
     "CameraBenchOptions",

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import Device, Several, flag_name
+from arena_newton.cli.flags import Device, Several, bounds, check_bounds
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 __all__ = [
     "PolicyTrainOptions",
     "TeachableOptions",
-    "bounds",
     "check_choices",
     "check_numbers",
-    "check_ranges",
     "check_teachable",
     "look_fractions",
     "task_weights",
@@ -36,11 +29,6 @@ ROBOT_CAMERAS = tuple(name for name in CAMERAS if name != "world")
 """Cameras that policies are trained on: those that the robot carries."""
 BALANCES = ("picture", "task")
 """Draws of the samples."""
-
-
-def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
-    """Metadata of a flag whose number is within these bounds."""
-    return {"range": (low, high)}
 
 
 @dataclass(frozen=True)
@@ -154,27 +142,11 @@ def check_teachable(options: TeachableOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_ranges(options)
+    check_bounds(options)
     if options.recording == Path() or not options.recording.is_dir():
         raise InputError(f"--recording {options.recording}: name a folder that eval record wrote")
     if not options.task:
         raise InputError("--task: name the task of the demonstrations")
-
-
-def check_ranges(options: DataclassInstance) -> None:
-    """Refuse numbers that are out of the ranges of their fields.
-
-    Raises:
-        InputError: One is.
-    """
-    for one in dataclasses.fields(options):
-        if "range" in one.metadata:
-            low, high = one.metadata["range"]
-            value = getattr(options, one.name)
-            if value is not None and not (low <= value <= high and math.isfinite(value)):
-                flag = flag_name(one.name)
-                until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-                raise InputError(f"{flag} {value}: expected a number {until}")
 
 
 def task_weights(given: Sequence[str]) -> dict[str, float]:
@@ -242,7 +214,7 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_ranges(options)
+    check_bounds(options)
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if options.steps and options.minutes:
         raise InputError("--steps: is given by --minutes too; drop one of them")
