@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Device",
+    "Engine",
     "Several",
     "bounds",
     "check_bounds",
@@ -42,16 +43,17 @@ Several = Annotated[
     tuple[_T, ...], tyro.conf.arg(help_behavior_hint=lambda shown: f"(default: {shown})" if shown else "")
 ]
 """Values of a flag that takes at least one; help shows no default where it is none of them."""
-
-
-def _device_hint(shown: str) -> str:
-    return f"(default: {'the best there is' if shown in ('None', 'auto') else shown})"
-
-
 Device = Annotated[
-    _T, tyro.conf.arg(help="Device of simulation and networks: cpu, cuda, cuda:1.", help_behavior_hint=_device_hint)
+    _T,
+    tyro.conf.arg(
+        help="Device of simulation and networks: cpu, cuda, cuda:1.",
+        help_behavior_hint=lambda shown: f"(default: {'the best there is' if shown in ('None', 'auto') else shown})",
+    ),
 ]
 """Device of a command; None and `auto`: the best there is."""
+Engine = Annotated[
+    str, tyro.conf.arg(help="Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA).")
+]
 
 
 def flag_name(field: str) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from arena_newton.cli.flags import Device, Several
+from arena_newton.cli.flags import Device, Engine, Several
 from arena_newton.policies.chunk_flags import ChunkFlags
 
 __all__ = [
@@ -94,8 +94,7 @@ class Batch:
 
     worlds: int = 20
     """Episodes simulated at once."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    engine: Engine = "auto"
     device: Device[str | None] = None
 
 

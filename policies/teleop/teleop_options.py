@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from arena_newton.cli.flags import Device
+from arena_newton.cli.flags import Device, Engine
 from arena_newton.policies.protocols.ports import bind
 
 __all__ = ["BrowserOptions", "RedisOptions", "SessionOptions"]
@@ -26,8 +26,7 @@ class SessionOptions:
     """USD file that replaces or extends the task's scene."""
     rules: str = "paper"
     """Rule set: paper or released."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
+    engine: Engine = "auto"
     device: Device[str | None] = None
     fast_physics: bool = False
     """Run a 1 ms tracker at 5 ms x 4 substeps, on a machine that is too slow for real time."""

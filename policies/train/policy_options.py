@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arena_newton.cli.flags import Device, Several, bounds, check_bounds
+from arena_newton.cli.flags import Device, Engine, Several, bounds, check_bounds
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.chunk_flags import LABELS
@@ -129,8 +129,7 @@ class TeachableOptions:
     """Episodes that are simulated at once."""
     max_steps: int | None = field(default=None, metadata=bounds(1, 10_000_000))
     """Cap on the step budget of the task [ticks of 0.02 s]."""
-    engine: str = "mujoco"
-    """Physics engine: mujoco, warp or auto."""
+    engine: Engine = "mujoco"
     device: Device[str] = "cpu"
     out: Path | None = None
     """Write the result to this JSON file."""
