@@ -3,11 +3,10 @@
 import dataclasses
 import json
 import math
-import shutil
-from pathlib import Path
 from typing import Annotated
 
 import pytest
+from made_folders import JOURNALS, stored
 from rows import episodes, full, record
 
 from arena_newton.errors import InputError
@@ -20,18 +19,9 @@ from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, re
 from arena_newton.files.stored_json import Fit
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
-JOURNALS = Path(__file__).parent / "journals"
 NEW_KEYS = ("schema", "phases", "predicates", "progress", "events")
 RAN = {1: ("stand", 20), 2: ("expert", 150), 3: ("expert", 150)}
 """Schema → policy and steps of its run."""
-
-
-def stored(schema, folder):
-    """A results folder that a real run of two episodes wrote, with a journal of this schema."""
-    folder.mkdir()
-    shutil.copy(JOURNALS / f"schema_{schema}.jsonl", folder / "episodes.jsonl")
-    shutil.copy(JOURNALS / f"schema_{schema}.config.json", folder / "config.json")
-    return folder
 
 
 @pytest.mark.parametrize("schema", range(1, SCHEMA + 1))

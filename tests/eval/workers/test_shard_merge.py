@@ -2,11 +2,11 @@
 
 import json
 import os
-import re
 import shutil
 
 import pytest
 from eval_fakes import factories
+from made_folders import configuration, contents
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
@@ -18,24 +18,6 @@ from arena_newton.rules import seeding
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
-TIMES = re.compile(rb'"(wall_s|started_at|finished_at|duration_sec|previous)": ?("[^"]*"|[0-9.e+-]+)')
-
-
-def contents(folder):
-    """Every file of a results folder but its configuration, without the times at which episodes were played."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "config.json"]
-    found = {}
-    for path in files:
-        data, name = path.read_bytes(), str(path.relative_to(folder))
-        timed = path.name == "episodes.jsonl" or path.parent.name == "episodes"
-        found[name] = TIMES.sub(rb"\1", data) if timed else data
-    return found
-
-
-def configuration(folder):
-    """The part of a config.json that says what was played."""
-    document = json.loads((folder / "config.json").read_text())
-    return {key: value for key, value in document.items() if key not in ("status", "options")}
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from eval_fakes import factories
+from made_folders import stored
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.chain import head
@@ -97,8 +98,6 @@ def test_honest_folders_are_not_accused(honest, tmp_path, capsys):
 
 def test_older_journals_are_marked(tmp_path, capsys):
     """A folder of every older version is read and said to be unchained."""
-    from test_schema import stored
-
     for schema in (1, 2):
         code = main(["audit", str(stored(schema, tmp_path / str(schema)))])
         said = capsys.readouterr().out

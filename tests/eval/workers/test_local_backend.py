@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from eval_fakes import factories
-from test_shard_merge import configuration, contents
+from made_folders import configuration, contents
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.workers.backend import WorkerLost
@@ -19,7 +19,7 @@ from arena_newton.eval.workers.local_backend import LocalBackend
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.physics import devices
 
-FAKES = Path(__file__).with_name("fakes_by_name.py")
+FAKES = Path(__file__).parents[1] / "fakes_by_name.py"
 ENDS = 20.0
 """A process has ended within this time [s]."""
 

@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
-from test_matrix import SUITE, journals
-from test_shard_merge import contents
+from made_folders import SUITE, contents, journals
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main

@@ -12,38 +12,14 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from made_folders import document_of, folder_with, recorded
 from rows import episodes, made, record
 
-from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run, results_json
-from arena_newton.eval.records.journal import Journal
 from arena_newton.eval.reports import report
 from arena_newton.eval.reports.wording import REMOTE, replay_command, rules_that_ran
 from arena_newton.eval.statistics.stats import error_reasons, wilson
-
-
-def document_of(planned, **config):
-    """Content of a config.json."""
-    identity = {"rules": "paper", "seeds": [0, 1, 2], "repeats": 20, "max_steps": None, "tracker": "t"} | config
-    return {
-        "config": identity,
-        "config_hash": "0123456789ab",
-        "options": {},
-        "planned": planned,
-        "gym_ids": {n: tasks.get(n).gym_id for n in tasks.names()},
-        "rule_set": {"fall": "tilt > 60° <&>"},
-    }
-
-
-def folder_with(tmp_path, rows, planned, **config):
-    """A results folder with these journal records."""
-    tmp_path.mkdir(exist_ok=True)
-    (tmp_path / "config.json").write_text(json.dumps(document_of(planned, **config)))
-    with Journal(tmp_path / "episodes.jsonl") as journal:
-        for row in rows:
-            journal.append(record(row))
-    return tmp_path
 
 
 def test_results_json(tmp_path):
@@ -113,13 +89,6 @@ def html(folder):
     """The parsed page of a results folder."""
     report.write_reports(load_run(folder))
     return Tree((folder / "report.html").read_text(encoding="utf-8"))
-
-
-def recorded(row, *names):
-    """A record with recordings."""
-    stem = f"{row['task']}__base__seed{row['group_seed']}__repeat{row['repeat']}"
-    paths = {n: f"strips/{stem}__{n[:-6]}.jpg" if n.endswith("strip") else f"videos/{stem}__{n}.mp4" for n in names}
-    return row | {"media": paths}
 
 
 def test_html_is_self_contained_and_escaped(tmp_path):

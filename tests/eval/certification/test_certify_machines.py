@@ -18,7 +18,7 @@ from arena_newton.eval.certification.checks import machines
 from arena_newton.eval.certification.checks.same_files import contents
 from arena_newton.eval.workers.shard_merge import merge
 
-FAKES = Path(__file__).with_name("fakes_by_name.py")
+FAKES = Path(__file__).parents[1] / "fakes_by_name.py"
 
 
 def certified(folder, check, **changes):

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from test_shard_merge import configuration, contents
+from made_folders import configuration, contents
 
 from arena_newton.eval.suites.suite_records import read_suite
 from arena_newton.eval.workers.shard_merge import merge

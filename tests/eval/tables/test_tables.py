@@ -1,8 +1,8 @@
 """One table of several runs: what it counts, what it says of them, and which runs it does not mix."""
 
 import pytest
+from made_folders import document_of, folder_with
 from rows import episodes, record
-from test_report import document_of, folder_with
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main

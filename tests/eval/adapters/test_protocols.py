@@ -31,7 +31,7 @@ from arena_newton.eval.play.run import Factories
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.replay import ReplayEpisodes
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "policies" / "checkpoints"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "policies" / "checkpoints"))
 from made_checkpoints import SIDE, facts, save
 
 TASKS = ("boxing", "vis_navi")

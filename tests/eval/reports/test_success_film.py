@@ -5,9 +5,9 @@ import shutil
 import av
 import numpy as np
 import pytest
+from made_folders import folder_with, recorded
 from PIL import Image
 from rows import episodes
-from test_report import folder_with, recorded
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.reports import success_film

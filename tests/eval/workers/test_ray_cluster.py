@@ -9,8 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 from eval_fakes import factories
-from test_matrix import SUITE, journals
-from test_shard_merge import contents
+from made_folders import SUITE, contents, journals
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.workers.shard_merge import merge
@@ -18,8 +17,8 @@ from arena_newton.eval.workers.shard_merge import merge
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray_nodes import RAY, Nodes, actors, descendants, free_port, kill_all, wait_for  # noqa: E402  # its psutil comes with Ray
 
-ROOT = Path(__file__).resolve().parents[2]
-FAKES = Path(__file__).with_name("fakes_by_name.py")
+ROOT = Path(__file__).resolve().parents[3]
+FAKES = Path(__file__).parents[1] / "fakes_by_name.py"
 PLAN = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "1", "--repeats", "3", "--actions"]
 PLAN += ["--worlds", "2"]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+from made_folders import folder_with
 from made_suites import cell_of, outcomes, write_suite
 from rows import episodes
-from test_report import folder_with
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.sharding import Shard, dealt

@@ -17,7 +17,7 @@ from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
 from arena_newton.eval.suites.suite_call import plan_call
 from arena_newton.eval.suites.suite_options import MatrixOptions
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "visual", "--repeats", "4"]
 OPTIONS = RunOptions(task=("football", "boxing"), mode=("base", "visual"), repeats=4, engine="mujoco")
 

@@ -9,6 +9,7 @@ import time
 
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
+from made_folders import SUITE, WIDE, journals
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
@@ -17,28 +18,6 @@ from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_onl
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
 from arena_newton.eval.suites.suite_records import load_cell, read_events, read_suite
 from tests.children import Child
-
-SUITE = """
-name = "small"
-[defaults]
-seeds = [0, 1]
-repeats = 2
-worlds = 2
-engine = "mujoco"
-[matrix]
-tasks = ["boxing", "football"]
-trackers = ["twist2", "sonic"]
-modes = ["base", "visual"]
-[[policies]]
-name = "expert"
-spec = "expert"
-[[policies]]
-name = "still"
-spec = "stand"
-modes = "base"
-"""
-WIDE, SUITE = SUITE, SUITE.replace('["twist2", "sonic"]', '"twist2"')
-"""A suite of 12 cells, which is expanded only, and one of 6 that is played: 2 tasks x (2 modes + 1)."""
 
 
 @pytest.fixture
@@ -60,18 +39,6 @@ def suite(tmp_path):
 def call(suite, out, *flags, **changes):
     """Exit code of `eval matrix`."""
     return main(["matrix", str(suite), "--out", str(out), *flags], factories(**changes))
-
-
-def journals(out):
-    """Journal lines of every cell without clock times, by cell."""
-    found = {}
-    for path in sorted(out.glob("*/*/*/*/episodes.jsonl")):
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
-        for line in lines:
-            for key in ("durations", "started_at", "finished_at", "previous"):
-                del line[key]
-        found[path.parent.relative_to(out).as_posix()] = sorted(lines, key=lambda line: line["index"])
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -403,7 +403,7 @@ def test_wrong_options_are_refused(options, message):
 
 def test_the_page_about_gymnasium(brief):
     """Every Python block of docs/gym.md runs, one after the other, and gives what the page says."""
-    page = (Path(__file__).parents[2] / "docs" / "gym.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "gym.md").read_text()
     world = {"__name__": "docs_gym"}
     for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
         exec(compile(block, "docs/gym.md", "exec"), world)

@@ -6,8 +6,8 @@ import json
 import pytest
 import torch
 from eval_fakes import FakePolicy, factories
+from made_folders import document_of
 from rows import episodes, record
-from test_report import document_of
 
 from arena_newton import policies
 from arena_newton.errors import InputError

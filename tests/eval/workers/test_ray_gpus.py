@@ -7,14 +7,14 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from test_matrix import SUITE, journals
+from made_folders import SUITE, journals
 
 from arena_newton.eval.suites.suite_records import read_suite
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray_nodes import Nodes, wait_for  # noqa: E402  # its psutil comes with Ray
 
-FAKES = Path(__file__).with_name("fakes_with_gpus.py")
+FAKES = Path(__file__).parents[1] / "fakes_with_gpus.py"
 
 
 @pytest.fixture(scope="module")
