@@ -24,7 +24,7 @@ __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
 FILE = "certify.json"
 FEW = 20
-"""Fewer episodes of a cell than this are said to be few."""
+"""Number of episodes below which a cell is marked as having few."""
 MEANING = {
     "pass": "holds",
     "fail": "does not hold",

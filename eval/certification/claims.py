@@ -20,7 +20,7 @@ WORDS: Mapping[Verdict, tuple[str, str]] = {
     "note": ("holds with what its notes say", "hold with what their notes say"),
     "skip": ("was not measured", "were not measured"),
 }
-"""Verdict → what is said of one claim and of several."""
+"""Verdict → its wording for one claim and for several."""
 
 
 @dataclass(frozen=True)

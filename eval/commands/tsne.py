@@ -164,7 +164,7 @@ def _line(task: str, one: ActionMap, result: JsonObject) -> str:
     ]
     number = result["samples_per_source"]
     sources = f"{number} + {number} observations of {one.names[0]} and {one.names[1]}"
-    return f"{task}: {sources}; source told {', '.join(accuracies)}; chance 50 %"
+    return f"{task}: {sources}; source predicted {', '.join(accuracies)}; chance 50 %"
 
 
 def _title(spec: str) -> str:

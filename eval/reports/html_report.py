@@ -134,7 +134,7 @@ def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], cells: int) -> dict[str, object]:
-    """The table; names that are the same in every row are said once, above it."""
+    """The table; names that are the same in every row are shown once, above it."""
     same = {i for i in (1, 2, 3) if len({row[i] for row in rows}) == 1}
     kept = [i for i in range(len(head)) if i not in same]
 

@@ -72,7 +72,7 @@ class PairComparison:
 
     @property
     def differs(self) -> bool:
-        """True if the contenders are told apart over all strata."""
+        """True if the contenders differ significantly over all strata."""
         return self.p_holm <= LEVEL
 
 
@@ -86,7 +86,7 @@ class Standing:
     """95 % Wilson interval of the rate, as `high`."""
     high: float
     letters: str
-    """Contenders that share a letter are not told apart."""
+    """Contenders that share a letter do not differ significantly."""
 
     @property
     def rate(self) -> float:

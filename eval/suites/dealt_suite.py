@@ -185,8 +185,8 @@ class _PoolPlayer(CellPlayer):
         with self.silence():
             journal = cell.held.enter_context(Journal(folder.journal))
             folder.prepare(config, journal.records)
-            folder.sweep()
-            cell.held.callback(folder.sweep)
+            folder.remove_unfinished()
+            cell.held.callback(folder.remove_unfinished)
             done, waiting = begun(config, folder, journal)
             if waiting:
                 cell.held.enter_context(folder.running())

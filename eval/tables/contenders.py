@@ -156,7 +156,7 @@ def read_contenders(
 
 
 def _titles(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the folders' paths by which they can be told apart."""
+    """The shortest ends of the folders' paths by which they differ."""
     paths = [folder.resolve() for folder in folders]
     for number in range(1, max(len(path.parts) for path in paths) + 1):
         names = [plain_text("/".join(path.parts[-number:]), None) for path in paths]

@@ -32,7 +32,7 @@ _HUNG_UP = getattr(select, "POLLRDHUP", select.POLLHUP)
 
 @dataclass(eq=False)
 class HttpRobot:
-    """One robot, as far as it can be told from others."""
+    """One robot, as far as requests distinguish it from others."""
 
     owner: str
     """Whom its session belongs to."""

@@ -258,7 +258,7 @@ class PolicyServer:
 
         Args:
             owner: Connection, or whoever the session belongs to.
-            begin: What is said of the episode.
+            begin: The client's description of the episode.
             held: The session lives until its owner leaves; otherwise it may lose its row when it is idle.
 
         Raises:

@@ -72,7 +72,7 @@ class PageServer:
         Args:
             listening: The port, from `ports.bind`; it belongs to the server from now on.
             token: What every address must name; `new_token` makes one.
-            facts: What the page is told once, as JSON.
+            facts: Facts that the page gets once, as JSON.
             frame: Address of the page that shows the world; None: none.
         """
         self._token = token

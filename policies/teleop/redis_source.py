@@ -41,7 +41,7 @@ QUALITY = 80
 COMMANDS: dict[str, Control] = {name: name for name in get_args(Control) if name != "quit"}
 """The original's commands, which are the session's."""
 MOST_LINES = 50
-"""Kinds of unfit input that are told."""
+"""Most kinds of unfit input that are reported."""
 RESET: Control = "discard_and_reset"
 """Control for a reset from outside: an episode that was reset is no demonstration."""
 
@@ -109,7 +109,7 @@ class RedisSource:
         )
 
     def begin(self, view: Telemetry) -> None:
-        """An episode begins: whatever was sent before is forgotten, and the sender is told that input counts from now.
+        """An episode begins: what was sent before is forgotten, and the sender is notified that input counts from now.
 
         After the person's own `start` the sender's stream goes on as it is: a new epoch would put it back to idle.
         """

@@ -285,7 +285,7 @@ class TrackerRunner(OnPolicyRunner):
 
     def anneal(self, elapsed: float) -> None:
         """Reduce target KL and entropy coefficient towards the end of a time limit; see `annealed`."""
-        left = annealed(elapsed, self.options.settle)
+        left = annealed(elapsed, self.options.anneal)
         self.alg.desired_kl = self.options.desired_kl * left
         self.alg.entropy_coef = self.options.entropy * left
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -115,7 +115,8 @@ class TrainOptions:
     """Target KL divergence per iteration (adaptive learning rate)."""
     entropy: float = field(default=0.0015, metadata=at_least(0))
     """Entropy coefficient."""
-    settle: float = field(default=0.0, metadata=within(0, 1))
+    # `--settle` in the commands of earlier cards.
+    anneal: Annotated[float, tyro.conf.arg(aliases=("--settle",))] = field(default=0.0, metadata=within(0, 1))
     """Final fraction of `--minutes` over which target KL and entropy coefficient are annealed to 10 %."""
     init_std: float = field(default=0.5, metadata=within(1e-3, 10))
     """Initial standard deviation of the action noise."""
@@ -194,8 +195,8 @@ def check(options: TrainOptions) -> None:
         if "bounds" in option.metadata:
             _refuse_outside(flag_name(option.name), getattr(options, option.name), *option.metadata["bounds"])
     _refuse_outside("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
-    if options.settle > 0.0 and options.minutes <= 0.0:
-        raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
+    if options.anneal > 0.0 and options.minutes <= 0.0:
+        raise InputError(f"--anneal {options.anneal}: a fraction of --minutes, which is not given")
     if options.resume is not None and options.start_from is not None:
         raise InputError("--resume continues a training, --start-from begins one: pass one of the two")
     if options.library is not None and options.families:

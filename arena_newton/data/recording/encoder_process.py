@@ -140,7 +140,7 @@ class _Films:
                 self._answer({"dropped": number})
 
     def _add(self, number: int, picture: np.ndarray, depth: np.ndarray | None) -> None:
-        """Append a picture; a film that cannot be written is told and dropped."""
+        """Append a picture; a film that cannot be written is reported and dropped."""
         if (film := self._films.get(number)) is None:
             return
         try:

@@ -99,6 +99,6 @@ def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Table]:
     for a, b in itertools.combinations(range(len(failures[0].stages)), 2):
         counts = Counter((one.stages[b], one.stages[a]) for one in failures)
         table = tuple((str(row), *(str(counts[row, text]) for text in FailureStage)) for row in FailureStage)
-        head = (JUDGES[b], *(f"said {stage}" for stage in FailureStage))
+        head = (JUDGES[b], *(f"found {stage}" for stage in FailureStage))
         sheets.append(Table(head, table, title=f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)"))
     return sheets

@@ -1,4 +1,4 @@
-"""A task, tracker and mode ends by the width of its interval alone, said before the first episode."""
+"""A task, tracker and mode ends by the width of its interval alone, fixed before the first episode."""
 
 import json
 import math
@@ -123,13 +123,13 @@ def test_what_does_not_fit_is_refused(flags, said, tmp_path, capsys):
 
 
 def test_another_rule_is_refused_in_the_same_folder(tmp_path, capsys):
-    """A rule that was said is kept: neither dropped nor changed after episodes were seen."""
+    """A rule that was fixed is kept: neither dropped nor changed after episodes were seen."""
     flags = [*RUN, "--until-width", "0.5", "--max", "6", "--out", str(tmp_path / "a")]
     assert main(flags, factories()) == 0
     assert main([*flags, "--max", "9"], factories()) == 2
     capsys.readouterr()
     assert main(["resume", str(tmp_path / "a"), "--max", "9"], factories()) == 2
-    assert capsys.readouterr().err.startswith("error: --max was 6, now 9: it was said before the first episode")
+    assert capsys.readouterr().err.startswith("error: --max was 6, now 9: it was fixed before the first episode")
     assert main([*RUN, "--seeds", "0", "--out", str(tmp_path / "a"), "--repeats", "2"], factories()) == 2
     assert "another configuration" in capsys.readouterr().err
 

@@ -290,7 +290,7 @@ def test_errors_are_told_with_reasons(tmp_path, capsys):
     assert "\\u001b" not in (folder / "episodes.jsonl").read_text()
 
 
-def test_partial_recordings_are_swept_away(tmp_path):
+def test_partial_recordings_are_removed(tmp_path):
     """Partial files of an interrupted recording are gone when a run ends, however it ends."""
     folder = tmp_path / "s"
 
