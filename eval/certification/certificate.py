@@ -137,7 +137,7 @@ def _warnings(facts: Facts) -> list[str]:
 
 
 def _measured(one: ClaimFinding) -> list[tuple[str, str]]:
-    """Of a claim each check's name and what it measured."""
+    """Names of a claim's checks, with what each measured."""
     skipped = {"skip": "not measured: "}
     return [(check.name, f"{skipped.get(finding.verdict, '')}{finding.summary}") for check, finding in one.findings]
 

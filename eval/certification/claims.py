@@ -12,7 +12,7 @@ from arena_newton.files.text import counted
 __all__ = ["CLAIMS", "Claim", "ClaimFinding", "claimed", "verdict_of"]
 
 WORST_FIRST: tuple[Verdict, ...] = ("fail", "note", "pass", "skip")
-"""Of several checks the first of these is a claim's verdict: what was not measured says nothing against it."""
+"""Order of verdicts: a claim's is the first that one of its checks has; what was not measured counts last."""
 
 WORDS: Mapping[Verdict, tuple[str, str]] = {
     "fail": ("does not hold", "do not hold"),

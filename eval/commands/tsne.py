@@ -39,9 +39,9 @@ class TsneOptions:
     out: str = "tsne"
     """Folder to write: tsne.json, and one picture per task."""
     seed: int = 0
-    """Of the embedding and of the policy's noise."""
+    """Seed of the embedding and of the policy's noise."""
     perplexity: float = 30.0
-    """Of the embedding."""
+    """Perplexity of the embedding."""
     batch: int = 50
     """Observations that the policy is given at once."""
 

@@ -98,7 +98,7 @@ class RunConfig:
     planned: int
     """Episodes of the whole plan."""
     repeats: int
-    """As in the flags, like the device, but never left open."""
+    """Repeats of the flags, never left open; the device likewise."""
     device: str
     policy: str
     """Spec that the policy is made with, a path in it as the user gave it."""

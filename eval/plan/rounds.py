@@ -28,7 +28,7 @@ class WidthRule:
     """Rule by which a task, tracker and mode has enough episodes; printed before the first one is played."""
 
     width: float
-    """Of the 95 % interval of the success rate, 0 to 1."""
+    """Width of the 95 % interval of the success rate, 0 to 1."""
     most: int
     """Episodes at most."""
     seeds: int

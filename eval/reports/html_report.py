@@ -43,7 +43,7 @@ FAILURES_FIRST = ("fall", "timeout", "error", "success")
 SHOWN_STRIPS = 12
 """Episodes whose strips are shown; those of the others are folded."""
 SHOWN_SUCCESSES = 3
-"""So many of them are kept for successes."""
+"""Number of them that are kept for successes."""
 LONGEST_ERROR = 300
 """Characters of an episode's error message in the list of episodes."""
 TICKS = (0, 25, 50, 75, 100)

@@ -63,7 +63,7 @@ class PairComparison:
     second: int
     strata: tuple[StratumPair, ...]
     p: float
-    """Of the stratified exact test."""
+    """Probability of the stratified exact test."""
     p_holm: float
     """Adjusted for the number of pairs."""
     excess: float
@@ -104,9 +104,9 @@ class Comparison:
     left_out: tuple[Stratum, ...]
     """Those that some contender lacks."""
     overall: tuple[Standing, ...]
-    """Of each contender over all strata."""
+    """Standing of each contender over all strata."""
     within: Mapping[Stratum, tuple[Standing, ...]]
-    """Of each contender in each stratum."""
+    """Standing of each contender in each stratum."""
     pairs: tuple[PairComparison, ...]
 
 

@@ -49,7 +49,7 @@ LONGEST_MESSAGE = 4096
 STATUS_PERIOD = 0.1
 """Time between two messages of state to the page [s]."""
 JPEG_QUALITY = 80
-"""Of the head camera's pictures, in percent."""
+"""Quality of the head camera's pictures, in percent."""
 PAGES = 8
 """Most pages at once, all but one of which have been taken over."""
 PONG_SECONDS = 20.0

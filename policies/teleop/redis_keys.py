@@ -119,7 +119,7 @@ BACKENDS: Mapping[str, Backend] = {
     "twist2": Backend("twist2", _COMMON),
     "sonic_joint29": Backend("sonic_joint29", _COMMON + _GMR),
 }
-"""By name: `twist2` sends the mimic command, `sonic_joint29` root pose and joints of the retargeted person."""
+"""Formats by name: `twist2` sends the mimic command, `sonic_joint29` root pose and joints of the retargeted person."""
 
 
 def parse(key: str, raw: bytes) -> object:

@@ -37,7 +37,7 @@ ANSWER = 0.1
 AGAIN = 1.0
 """Time between two attempts to reach a lost server [s]."""
 QUALITY = 80
-"""Of the head camera's JPEG."""
+"""Quality of the head camera's JPEG."""
 COMMANDS: dict[str, Control] = {name: name for name in get_args(Control) if name != "quit"}
 """The original's commands, which are the session's."""
 MOST_LINES = 50

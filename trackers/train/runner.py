@@ -117,7 +117,7 @@ class TrackerRunner(OnPolicyRunner):
         self._resumed: Path | None = None
 
     def _configure_multi_gpu(self) -> None:
-        """As rsl_rl, which knows GPUs only; processes on the CPU talk through gloo."""
+        """Configure as rsl_rl does, which knows GPUs only; processes on the CPU talk through gloo."""
         processes = int(os.environ.get("WORLD_SIZE", "1"))
         if processes == 1 or self.device != "cpu":
             super()._configure_multi_gpu()

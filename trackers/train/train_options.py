@@ -127,7 +127,7 @@ class TrainOptions:
     keep_last: int = field(default=3, metadata=at_least(0))
     """Number of latest checkpoints that are kept, 0 = all."""
     keep_every: int = field(default=10, metadata=at_least(0))
-    """Of the older ones every n-th is kept, 0 = none."""
+    """Interval of the older ones that are kept: every n-th, 0 = none."""
     print_interval: int = field(default=20, metadata=at_least(1))
     """Iterations between printed lines."""
     log_interval: int = field(default=5, metadata=at_least(1))

@@ -38,15 +38,15 @@ SPREAD = 0.15
 EPISODES = 60
 """Episodes of each task: the protocol's."""
 DIFFERENCES = (0.0, 0.1, 0.2)
-"""By how much the last of the policies is better, in every episode."""
+"""Advantages of the last of the policies, in every episode."""
 SPREADS = (0.0, 0.05, 0.1, 0.2)
 """Standard deviations between trainings of one recipe."""
 TRAININGS = 3
-"""Of a recipe, where they say how much they differ."""
+"""Trainings of a recipe, where they show how much they differ."""
 SLACK = 1e-4
 """Probability with which a test that keeps its level exactly is found to exceed it."""
 LEAST_COVERAGE = 0.93
-"""Of the intervals of nominally 95 %, which are approximations."""
+"""Least coverage of the intervals of nominally 95 %, which are approximations."""
 SEED = 20260611
 
 

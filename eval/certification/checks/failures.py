@@ -25,7 +25,7 @@ LEAST = 0.8
 QUICK_FAILURES = 2
 """Episodes of each kind of failure and tracker under --quick, all in one task."""
 ENOUGH = 20
-"""From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
+"""Episodes from which on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
 
 TUNED: Mapping[str, tuple[int, ...]] = {

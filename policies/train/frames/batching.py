@@ -122,7 +122,7 @@ class BatchMaker:
     tracker_vector: Sequence[str] = ()
     """Trackers in the order of the numbers that follow in it, as of `CheckpointFacts`; none: it has no such numbers."""
     tall: int = 0
-    """As of `gathered_pictures`."""
+    """Height as in `gathered_pictures`."""
     tokens: Mapping[str, torch.Tensor] | None = None
     """Tokens of language of every instruction, or of every row: key → shape [instructions or rows, L]."""
     tokens_per_row: bool = False

@@ -230,11 +230,14 @@ def test_wrong_calls_are_one_error(made, tmp_path, capsys, flags, message):
 
 
 def test_pictures_of_another_size_are_refused(made):
-    """A policy that wants another size is told what the dataset has."""
+    """A policy that wants another size, or depth, is refused with what the dataset has."""
     data = DatasetObservations(made[0][0])
     policy = Linear()
     policy.camera = CameraConfig(width=224, height=224)
     with pytest.raises(InputError, match="its pictures have 64x64 pixels, the policy wants 224x224"):
+        predict(policy, data, data.sample("boxing", 4, 1), batch=4)
+    policy.camera = CameraConfig(width=SIZE, height=SIZE, depth=True)
+    with pytest.raises(InputError, match="policy linear: observes the depth of front, which datasets do not hold"):
         predict(policy, data, data.sample("boxing", 4, 1), batch=4)
 
 
