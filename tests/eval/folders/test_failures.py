@@ -354,7 +354,7 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
     good = failures(played(lambda body: OF[body] * 5))
     assert good.verdict == "pass" and good.summary.startswith("30 of 30")
-    assert "| perception      |               5 |" in capsys.readouterr().out
+    assert "| perception      |                5 |" in capsys.readouterr().out
     assert good.sheets[0].rows[0] == ("perception", "5", "0", "0", "0", "0", "0", "1.00", "1.00")
     assert any("football" in note for note in good.notes)
     one = failures(played(lambda body: OF[body] * 5 + OF["clumsy"] * (body == "misaimed")))
