@@ -84,7 +84,7 @@ def test_findings_follow_the_data(cells):
     assert found["tracker-conditioned: SONIC ahead on HOI"].paper == "+16.1 points"
     text = findings_text.findings_text(list(found.values()))
     assert "## cross-GMT: twist2 → sonic: undecided" in text and "these networks" in text.splitlines()[2]
-    assert "13 points" in text and "26 through another" in text and "28 of a difference" in text
+    assert "13 points" in text and "26 through another" in text and "28 for a difference" in text
 
 
 def test_a_claim_that_fails_does_not_reproduce():
