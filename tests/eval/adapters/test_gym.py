@@ -287,7 +287,7 @@ def test_a_fall_in_the_start_up(make, monkeypatch):
 
 
 def test_an_action_that_is_not_finite_ends_one_episode(make, brief):
-    """It is an error, told as truncated; the other world goes on."""
+    """It is an error, reported as truncated; the other world goes on."""
     env = make("football", startup="reset")
     env.reset(seed=0)
     action = stand(env)

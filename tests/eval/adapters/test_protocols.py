@@ -248,7 +248,7 @@ def test_lerobots_recording_has_the_task_vector(checkpoint, monkeypatch, tmp_pat
 
 
 def test_the_vector_names_the_task():
-    """Every world is told task and tracker, under LeRobot's name and under that of datasets; the spaces say so."""
+    """Every world gets task and tracker, under LeRobot's name and under that of datasets; the spaces say so."""
     vectors = {"task_vector": "boxing,vis_navi", "tracker_vector": "sonic,twist2"}
     config = ArenaNewtonEnv(task="vis_navi", engine="mujoco", device="cpu", labels="v4", **vectors)
     assert config.features["observation.environment_state"].shape == (5,)

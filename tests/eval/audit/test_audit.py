@@ -97,7 +97,7 @@ def test_honest_folders_are_not_accused(honest, tmp_path, capsys):
 
 
 def test_older_journals_are_marked(tmp_path, capsys):
-    """A folder of every older version is read and said to be unchained."""
+    """A folder of every older version is read and reported as unchained."""
     for schema in (1, 2):
         code = main(["audit", str(stored(schema, tmp_path / str(schema)))])
         said = capsys.readouterr().out

@@ -121,7 +121,7 @@ def test_a_sound_benchmark_passes(tmp_path, capsys):
     ],
 )
 def test_tasks_that_need_no_legs_are_named(tmp_path, envs, name, verdict, said):
-    """Success with frozen legs fails the benchmark; of a gliding base the reason is said where it is known."""
+    """Success with frozen legs fails the benchmark; of a gliding base the reason is given where it is known."""
     code = certify.run(options(tmp_path), factories(**PARTS), bodies=bodies(**envs), checks=legs.CHECKS)
     assert code == (verdict == "fail")
     found = read(tmp_path)[name]
@@ -270,7 +270,7 @@ def test_a_damaged_measurement_is_measured_again(tmp_path, text):
 
 
 def test_the_page_needs_no_other_file(tmp_path):
-    """Pictures are inside, texts stay texts, and what is missing is said."""
+    """Pictures are inside, texts stay texts, and what is missing is named."""
     picture = tmp_path / "strip.png"
     picture.write_bytes(b"\x89PNG")
     check = Check("legs", "Are <legs> needed?", lambda context: found)

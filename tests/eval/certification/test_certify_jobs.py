@@ -73,7 +73,7 @@ def test_a_process_runs_the_code_that_started_it(tmp_path, monkeypatch):
 
 
 def test_a_quick_process_plays_all_checks_of_a_task(tmp_path, monkeypatch):
-    """Of a few episodes a process's start is the longest part: one a task, and one for what measures tasks unlike."""
+    """A process's start is the longest part of a few episodes: one per task, and one for what measures tasks unlike."""
     log = stand_in(tmp_path, monkeypatch)
     checks = ["physics", "camera", "rules", "batches", "swap", "shards", "statistics"]
     options = CertifyOptions(out="x", jobs=1, quick=True)

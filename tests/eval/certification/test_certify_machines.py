@@ -165,7 +165,7 @@ def test_without_ray_it_says_so(tmp_path, monkeypatch):
 
 
 def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
-    """Of the processes below a run the one that plays is killed, once an episode has ended and not before."""
+    """The process below a run that plays is killed, once an episode has ended and not before."""
     monkeypatch.setattr(machines, "POLL", 0.01)
     (tmp_path / "episodes.jsonl").write_text("")
     waits = "import time; time.sleep(60)"

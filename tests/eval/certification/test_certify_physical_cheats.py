@@ -72,7 +72,7 @@ def gravity_less_3_percent(monkeypatch):
 
 
 def friction_less_10_percent(monkeypatch):
-    """Of every contact."""
+    """Friction of every contact."""
     compiled(monkeypatch, lambda model: model.geom_friction.__imul__(0.9))
 
 

@@ -134,7 +134,7 @@ def test_a_touch_that_moves_nothing_has_not_reached_a_loose_object():
 
 
 def test_who_passes_through_the_pose_has_not_come_into_it():
-    """To stay there for 60 ticks is posture, to cross it in a spell nearby only for who stays for half the episode."""
+    """Staying there for 60 ticks is posture; crossing it nearby is so only for who stays half the episode."""
     passes = UNTOUCHED | {"task": "open_door", "stop_distance": 0.12, "stop_bearing": 0.82}
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 1})) == "approach"
     assert stage_of(judged(**passes | {"engaged_ticks": 161, "aligned_ticks": 61})) == "posture"
@@ -145,7 +145,7 @@ def test_who_passes_through_the_pose_has_not_come_into_it():
 
 
 def test_one_behaviour_beside_a_bar_has_one_name():
-    """A robot that stays near is held to a bar a tenth wider, and what lies within a tenth of its bar is told."""
+    """A robot that stays near is held to a bar a tenth wider, and what lies within a tenth of its bar is reported."""
     stays = UNTOUCHED | {"task": "pp_box", "engaged_ticks": 1500, "stop_bearing": 0.1, "reach_distance": 0.2}
     inside = judged(**stays | {"stop_distance": 0.39, "aligned_ticks": 900})
     beside = judged(**stays | {"stop_distance": 0.47, "aligned_ticks": 0})
@@ -160,7 +160,7 @@ def test_one_behaviour_beside_a_bar_has_one_name():
 
 
 def test_waiting_in_view_is_an_ending():
-    """It is told beside the stage of a robot that stays near what it sees for half of its episode, and of no other."""
+    """It is shown with the stage of a robot that stays near what it sees for half of its episode, and of no other."""
     waiting = {"engaged_ticks": 450, "looks": 10, "looks_seen": 5}
     assert waits_in_view(judged(**waiting)) and stage_of(judged(**waiting)) == "contact"
     assert not waits_in_view(judged(**waiting | {"engaged_ticks": 449}))
@@ -310,7 +310,7 @@ def test_the_real_failures_are_at_hand():
 
 
 def test_a_confusion_has_precision_and_recall():
-    """Recall is of what was scripted, precision of what is said; what did not fail counts for neither."""
+    """Recall is of what was scripted, precision of what is found; what did not fail counts for neither."""
     a, b = FailureStage.APPROACH, FailureStage.CONTACT
     matrix = confusion([(a, a)] * 8 + [(a, b)] * 2 + [(b, b)] * 6 + [(b, None)] * 5)
     assert (matrix.recall(a), matrix.precision(a)) == (0.8, 1.0)
@@ -348,7 +348,7 @@ OF = {
 
 
 def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
-    """Scripted failures with their stages pass; one kind that is mostly said to be another fails and is named."""
+    """Scripted failures with their stages pass; one kind that is mostly taken for another fails and is named."""
     monkeypatch.delitem(INTERACTIONS, "football")
     assert set(OF) == set(SABOTAGES)
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
@@ -397,7 +397,7 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
 
 @pytest.mark.parametrize(("count", "seeds"), [(4, 1), (20, 1), (60, 3)])
 def test_a_cell_may_begin_at_another_group_seed(tmp_path, count, seeds):
-    """As many seeds and repeats as from 0 on; the folder is another one, and the protocol's keeps its name."""
+    """Seeds and repeats are as many as from 0 on; the folder is another one, and the protocol's keeps its name."""
     context = Context(CertifyOptions(episodes=count), tmp_path, ("boxing",), print)
     (first, repeats), (later, same) = context.plan(), context.plan(HELD_OUT)
     assert repeats == same and len(first) == seeds

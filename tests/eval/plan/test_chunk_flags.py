@@ -62,7 +62,7 @@ def test_a_chunk_that_shows_to_be_too_short_stops_the_run(tmp_path, capsys):
 
 
 def test_latency_belongs_to_a_run(tmp_path, capsys):
-    """It is part of the identity, kept by resume, said by the report, and a folder of another one is refused."""
+    """It is part of the identity, kept by resume, named by the report, and a folder of another one is refused."""
     out = tmp_path / "late"
     assert run(out, "--latency-ticks", "4") == 0
     assert load_run(out).config["latency_ticks"] == 4

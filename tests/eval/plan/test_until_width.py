@@ -157,7 +157,7 @@ def stopped(rate, width):
 
 
 def test_what_stopping_by_width_costs():
-    """As the documentation says: it moves the mean by less than a point, and intervals cover as they do without it."""
+    """Stopping by width moves the mean by less than a point, as documented, and intervals cover as without it."""
     found = {rate: stopped(rate, 0.14) for rate in (0.02, 0.05, 0.1, 0.2, 0.3, 0.5)}
     assert [round(mean) for _, _, mean in found.values()] == [44, 56, 79, 130, 170, 200]
     assert [round(100 * error, 1) for error, _, _ in found.values()] == [-0.2, -0.6, -0.8, -0.5, -0.2, 0.0]

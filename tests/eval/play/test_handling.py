@@ -178,7 +178,7 @@ def test_a_carried_object_has_moved_from_where_hands_left_it(envs):
 
 
 def test_a_reluctant_robot_stands_before_a_door(envs):
-    """From the distance of the table on it stands still, and its arms hang all the time."""
+    """It stands still from the distance of the table on, and its arms hang all the time."""
     env = envs("open_door")
     acting(env)
     policy = SABOTAGES["reluctant"].body.equip(Factories()).policy("expert")

@@ -355,7 +355,7 @@ def test_another_environment_is_refused(half, uninterrupted, capsys):
 
 
 def test_other_versions_are_refused_unless_accepted(half, uninterrupted, capsys, monkeypatch):
-    """Other libraries are named and refused; accepted ones are added to config.json and told apart in the journal."""
+    """Other libraries are named and refused; accepted ones are added to config.json and kept apart in the journal."""
     installed = doctor.versions()
     monkeypatch.setattr(doctor, "versions", lambda: installed | {"tqdm": "9.9"})
     flags = ["--worlds", "1", "--task", "football", "boxing", "--seeds", "9"]
@@ -471,7 +471,7 @@ def test_a_journal_of_another_plan_is_refused(copied, capsys):
 
 @pytest.mark.parametrize("part", ["tracker", "policy"])
 def test_a_part_that_leaves_is_no_run_that_ended_well(tmp_path, capsys, part):
-    """SystemExit of a tracker or policy that is being made is told in one line with code 2."""
+    """SystemExit of a tracker or policy that is being made is reported in one line with code 2."""
 
     def leaves(*_, **__):
         sys.exit(0)

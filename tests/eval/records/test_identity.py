@@ -156,7 +156,7 @@ def test_rules_of_other_tasks_do_not_count():
 
 
 def test_difference_is_told_to_the_key():
-    """Of a table within an identity the key that differs is named."""
+    """The key that differs in a table within an identity is named."""
     stored = {"a": 1, "facts": {"drive": "soft", "dt": 0.001}}
     assert identity.differing_key(stored, stored) is None
     assert identity.differing_key(stored, {"a": 1, "facts": {"drive": "stiff", "dt": 0.001}}) == (

@@ -114,7 +114,7 @@ def test_atomic_write_onto_a_full_disk(tmp_path, monkeypatch):
 
 
 def test_atomic_write_where_nothing_can_be_written(tmp_path):
-    """If even the partial file cannot be removed, the first cause is told."""
+    """If even the partial file cannot be removed, the first cause is reported."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         write_atomic(tmp_path / "file" / "report.md", "new")

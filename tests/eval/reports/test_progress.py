@@ -117,5 +117,5 @@ def test_compiling_is_foreseen(tmp_path):
 
 
 def test_lengths_of_time():
-    """Times are told in the unit that a reader thinks in."""
+    """Times are given in the unit that a reader thinks in."""
     assert [duration(s) for s in (0.2, 59, 100, 3600, 12_000)] == ["1 s", "59 s", "2 min", "60 min", "3 h 20 min"]

@@ -225,7 +225,7 @@ def test_command_plays_the_episode_again(tmp_path):
 
 
 def test_command_asks_a_policy_server_in_the_same_way():
-    """Of a policy server the command keeps how it was asked, and the worlds at once if they matter."""
+    """The command keeps how a policy server was asked, and the worlds at once if they matter."""
     episode = record(EMPTY)
     options = {"policy": "remote:https://host:1", "remote_timeout": 3.5, "remote_retries": 4, "worlds": 7}
     options |= {"remote_insecure": True, "remote_sequential": True}
@@ -386,7 +386,7 @@ def test_page_in_a_browser(tmp_path, browser):
 
 
 def test_notes_tell_what_the_table_hides(tmp_path):
-    """Missing episodes, errors, overflow and a step cap are said in words."""
+    """Missing episodes, errors, overflow and a step cap are reported in words."""
     rows = episodes("football", (1, 0, 0))[:30]
     rows[3] |= {"outcome": "error"}
     rows[4] |= {"overflow": True}

@@ -215,7 +215,7 @@ def test_no_bit_of_an_interval_depends_on_the_order_of_tasks(tmp_path):
 
 
 def test_differences_tighten_with_episodes():
-    """Of unpaired episodes the interval shrinks as they grow, and nothing compared gives none."""
+    """The interval of unpaired episodes shrinks as they grow, and nothing compared gives none."""
     few, many = (difference([UnpairedCounts(6 * k, 10 * k, 3 * k, 10 * k)]) for k in (1, 50))
     assert few.value == many.value == pytest.approx(0.3)
     assert few.low < 0 < many.low and many.high - many.low < 0.2 * (few.high - few.low)
@@ -223,7 +223,7 @@ def test_differences_tighten_with_episodes():
 
 
 def test_conditions_that_share_episodes_through_a_third_are_paired():
-    """Of three conditions of a stratum those that share episodes are one group, others are independent of it."""
+    """Conditions of a stratum that share episodes are one group, others are independent of it."""
     a, b, c = (
         {n: n % 2 == 0 for n in range(20)},
         {n: n % 2 == 0 for n in range(20)},
@@ -236,7 +236,7 @@ def test_conditions_that_share_episodes_through_a_third_are_paired():
 
 
 def test_published_intervals_of_one_task():
-    """Of one task the interval is that of Agresti and Min where paired, of Agresti and Caffo where not."""
+    """The interval of one task is that of Agresti and Min where paired, of Agresti and Caffo where not."""
     # Agresti and Caffo: p1' = 7/12, p2' = 4/12.
     half = 1.959963984540054 * math.sqrt((7 / 12 * 5 / 12 + 4 / 12 * 8 / 12) / 12)
     found = difference([UnpairedCounts(6, 10, 3, 10)])
@@ -261,7 +261,7 @@ def coverage(n, first, second, interval):
 
 
 def test_few_episodes_of_a_task_are_covered():
-    """Of ten episodes of a task the interval holds the difference in about 95 of 100 experiments, wherever it is."""
+    """The interval of ten episodes of a task holds the difference in about 95 of 100 experiments, wherever it is."""
     for first, second in ((0.3, 0.1), (0.5, 0.3), (0.6, 0.1), (0.3, 0.6), (0.15, 0.15)):
         assert coverage(10, first, second, difference) > 0.93
 

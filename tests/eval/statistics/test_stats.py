@@ -63,7 +63,7 @@ def test_suite_needs_all_its_tasks():
 
 
 def test_a_task_outside_the_averages_is_named():
-    """A task that the paper's averages lack is told; its seven are not."""
+    """A task that the paper's averages lack is named; its seven are not."""
     assert outside_suites(suites()["ALL_AVG"]) == []
     assert outside_suites(["football", "golf", "golf"]) == ["golf"]
 

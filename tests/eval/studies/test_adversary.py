@@ -85,7 +85,7 @@ def test_placements_without_a_score_are_left_out():
 
 
 def test_one_unlucky_placement_is_not_the_worst():
-    """Of 1,000 the corner where all fail is named, not the one failure among successes, however far it failed."""
+    """The corner of 1,000 where all fail is named, not the one failure among successes, however far it failed."""
     rng = np.random.default_rng(0)
     points = [(float(x), float(y), 1.0) for x, y in rng.uniform(-1.2, 1.2, (1000, 2))]
     scores = [-0.5 - x if x > 0.8 and y > 0.8 else 0.5 for x, y, _ in points]
@@ -108,7 +108,7 @@ def test_a_circle_has_no_ends():
 
 
 def test_one_placement_that_was_played_often_counts_whole():
-    """Of two bags the one is named at which more failed, though ten of the other failed in a row."""
+    """The one of two bags at which more failed is named, though ten of the other failed in a row."""
     points = [(float(1 + k % 2),) for k in range(1000)]
     scores = [-1.0 if (k % 2 and k % 10 < 3) or (not k % 2 and k < 200) else 0.5 for k in range(1000)]
     shares = [

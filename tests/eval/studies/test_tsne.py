@@ -128,7 +128,7 @@ def test_uniformly_spaced_frames_of_each_episode(made):
 
 
 def test_a_smaller_source_leaves_the_other_spread(made, tmp_path):
-    """As many observations of each source, and of the larger one from its first episode to its last."""
+    """Sources have equally many observations, the larger one from its first episode to its last."""
     root, _ = make_dataset(tmp_path / "few", "sonic", 0.0, lengths=(25, 30))
     sources = [DatasetObservations(made[0][0]), DatasetObservations(root)]
     larger, smaller = as_many_of_each(sources, "boxing", 40, 10)
@@ -153,7 +153,7 @@ def test_each_observation_is_answered_alone(made):
 
 
 def test_a_linear_classifier_tells_what_differs():
-    """Sources that differ are told apart over held-out episodes; equal ones are not, constant ones neither."""
+    """Sources that differ are separated over held-out episodes; equal ones are not, constant ones neither."""
     rng = np.random.default_rng(0)
     sources, episodes = np.repeat([0, 1], 200), np.repeat(np.arange(40), 10)
     same = rng.standard_normal((400, 5))

@@ -117,7 +117,7 @@ def test_a_mark_of_byte_order_is_no_error(tmp_path):
 
 
 def test_rules_are_taken_in_order(tmp_path):
-    """Of several rules that fit a cell the last decides."""
+    """The last of several rules that fit a cell decides."""
     rules = (
         "[[cells]]\nexclude = { tracker = 'sonic' }\n[[cells]]\ninclude = { mode = 'visual', tracker = ['sonic'] }\n"
     )

@@ -116,7 +116,7 @@ def test_text_of_strangers_stays_text(tmp_path):
 
 
 def test_other_seeds_are_compared_unpaired(tmp_path):
-    """Runs without a common seed are compared unpaired, and it is said; of overlapping ones the common part counts."""
+    """Runs without a common seed are compared unpaired, with a note; of overlapping ones the common part counts."""
     a = run_in(tmp_path / "a", (4, 5, 7))
     rows = [row | {"group_seed": row["group_seed"] + 3, "tracker": "t"} for row in episodes("football", (14, 15, 17))]
     b = folder_with(tmp_path / "b", rows, 60, tracker=["t"], seeds=[3, 4, 5], engine="mujoco")
@@ -257,7 +257,7 @@ def test_what_is_compared_may_differ(folders, tmp_path):
 
 
 def test_rules_and_scenes_that_have_changed_are_named(tmp_path):
-    """Runs under rules of the same name but other content, or in other scenes, are compared, and it is said."""
+    """Runs under rules of the same name but other content, or in other scenes, are compared, with a note."""
     a, b = (run_in(tmp_path / name, (4, 5, 7), rules_hash=name * 12, scenes=f"{name}1") for name in ("a", "b"))
     notes = compared(tmp_path, a, b)["notes"]
     assert f"The rules have changed between the runs: {'a' * 12} {'b' * 12}, of the same tasks." in notes
@@ -276,7 +276,7 @@ def test_a_plan_says_what_it_can_tell(capsys):
 
 
 def test_the_sentence_has_the_direction_of_the_test():
-    """If few episodes of one task outweigh the mean, the better one is who won more episodes, and it is said."""
+    """If few episodes of one task outweigh the mean, the better one is who won more episodes, with a note."""
     outcomes = [
         {("big",): dict(enumerate([won] * 15 + [False] * 45)), ("small",): dict(enumerate([not won] * 4))}
         for won in (True, False)
@@ -309,7 +309,7 @@ def test_markdown_of_strangers_folders_opens_no_tag(tmp_path):
 
 
 def test_figures_have_no_minus_zero():
-    """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is said so."""
+    """A difference and its bounds that are shown as 0 have no minus, and what is too small for a number is shown so."""
     assert difference_text(Contrast(-0.0001, -0.004, 0.02, 0, 0, 1, 1, 0)) == "+0.0 (0 to 2)"
     assert difference_text(Contrast(0.12, 0.034, 0.206, 0, 0, 1, 1, 0)) == "+12.0 (3 to 21)"
     assert (p_text(mcnemar(1680, 0)), p_text(3e-5), p_text(0.034), p_text(1.0)) == ("<1e-300", "3e-05", "0.034", "1.00")

@@ -89,7 +89,7 @@ def test_suite_averages_of_the_paper_follow_from_its_tasks():
 
 
 def test_a_run_of_all_tasks_has_the_averages_of_act():
-    """From seeds that give ACT's rows follow its suite average of 28.33 ± 13.94 % and its 27 falls of 420."""
+    """ACT's seed rows give its suite average of 28.33 ± 13.94 % and its 27 falls of 420."""
     rates = {task: paper_numbers().in_gmt["twist2", "base", "act", task] for task in suites()["ALL_AVG"]}
     records = [
         record(row)
@@ -165,7 +165,7 @@ def test_a_missing_cell_and_a_missing_file_are_refused(copied):
 
 
 def test_mutated_files_are_read_or_refused(copied, mutants):
-    """Of many damaged copies each is read as it is or refused in one line; nothing else happens."""
+    """Each of many damaged copies is read as it is or refused in one line; nothing else happens."""
     rng, refused = random.Random(0), 0
     whole = {name: (copied / name).read_bytes() for name in FILES}
     for number in range(mutants):
@@ -229,7 +229,7 @@ def test_contrast_is_the_interval_of_agresti_and_min():
 
 
 def test_contrast_covers_the_truth():
-    """Of made experiments with known rates about 95 % of the intervals hold the true mean difference."""
+    """About 95 % of the intervals of made experiments with known rates hold the true mean difference."""
     rng, held = random.Random(1), 0
     for _ in range(400):
         strata = []

@@ -261,7 +261,7 @@ def test_an_unfinished_cell_is_no_sample(tmp_path):
 
 
 def test_unequal_seeds_are_never_compared_as_pairs(tmp_path):
-    """Of two folders of which one holds fewer episodes only common ones are compared, and the others are counted."""
+    """Common episodes alone of two folders, one of which has fewer, are compared, and the others are counted."""
     for tracker, won, played in (("twist2", 30, 60), ("sonic", 10, 20)):
         facts = {"family": "act", "facts": {"trackers": ["twist2"], "tasks": ["football"]}}
         cell = cell_of("x", "x", tracker, "football")
@@ -273,7 +273,7 @@ def test_unequal_seeds_are_never_compared_as_pairs(tmp_path):
 
 
 def test_plain_folders_without_a_suite(tmp_path):
-    """Results folders of `eval run` fill the tables with what their policy said of itself."""
+    """Results folders of `eval run` fill the tables with what their policy declared."""
     for tracker, won in (("twist2", 30), ("sonic", 6)):
         cell = cell_of("x", "x", tracker, "boxing")
         facts = {

@@ -103,7 +103,7 @@ def test_batches_cover_the_plan_once(driven, tmp_path):
 
 
 def test_losses_lose_nothing(driven):
-    """Whatever is told before a process is lost counts once; the rest is played again, with the same outcomes."""
+    """Events that are sent before a process is lost count once; the rest is played again, with the same outcomes."""
     undisturbed, _, _ = driven(out="u")
     count = iter(range(100))
 
@@ -117,7 +117,7 @@ def test_losses_lose_nothing(driven):
 
 
 def test_what_ended_before_a_loss_is_not_played_again(driven):
-    """An episode that was told of is in the journal, and in no later batch."""
+    """An episode that was reported is in the journal, and in no later batch."""
     known = set()
 
     def lost(assignment, told):

@@ -19,7 +19,7 @@ FAKES = Path(__file__).parents[1] / "fakes_with_gpus.py"
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """A machine with four cores and two GPUs, as far as Ray is told, and the file where processes say what they see."""
+    """A machine that Ray takes for one with four cores and two GPUs, and the file of what processes see."""
     folder = tmp_path_factory.mktemp("gpus")
     environment = {"FAKE_GPUS": str(folder / "gpus.txt"), "FAKE_TICK_S": "0.1"}
     found = Nodes(folder / "log.txt", environment, cores=4, gpus=2)

@@ -97,7 +97,7 @@ def test_a_merged_folder_merges_and_resumes(played, tmp_path, capsys):
 
 
 def test_unfinished_shards_are_named(copied):
-    """Of an unfinished shard, torn last line included, folder and numbers are named, of a missing one its number."""
+    """Folder and numbers of an unfinished shard, torn line included, are named, and the number of a missing one."""
     journal = copied / "s2" / "episodes.jsonl"
     journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]) + b'{"index": 4')
     with pytest.raises(InputError) as caught:
@@ -159,7 +159,7 @@ def test_overlaps_of_other_times_join(copied):
 
 
 def test_an_error_gives_way(copied, played):
-    """Of an episode that ended as an error in one folder the other folder's counts, as after --retry-errors."""
+    """The other folder's episode counts where it ended as an error in one, as after --retry-errors."""
     shutil.copytree(copied / "s1", copied / "again")
     broken = {"outcome": "error", "reason": "environment", "error": "out of memory", "steps": 0}
     edited(copied / "s1", lambda line: line.update(broken))
@@ -208,7 +208,7 @@ def strips(folder, *without):
 
 @pytest.mark.parametrize("first", [True, False], ids=["one has no strips", "one lost a strip"])
 def test_recordings_come_from_any_folder(copied, first):
-    """Of an episode that two folders have, a recording that one of them lacks is taken from the other."""
+    """A recording that one of two folders with an episode lacks is taken from the other."""
     shutil.copytree(copied / "s1", copied / "twin")
     numbers = strips(copied / "twin")
     if not first:

@@ -202,7 +202,7 @@ def test_a_batch_past_its_deadline_is_stopped(pool_of):
 
 
 def test_death_is_told_with_its_machine(pool_of):
-    """A machine that left the cluster is told apart from a process that died."""
+    """A machine that left the cluster is distinguished from a process that died."""
     for alive in (True, False):
         pool, fake, config = pool_of(ray_actors=1)
         all_idle(pool)
@@ -214,7 +214,7 @@ def test_death_is_told_with_its_machine(pool_of):
 
 
 def test_processes_that_never_begin_stop_the_run(pool_of, monkeypatch):
-    """Five in a row that break before an environment is built: the cause is told."""
+    """Five in a row that break before an environment is built: the cause is reported."""
     monkeypatch.setattr(worker_pool, "LONGEST_PAUSE", 0.0)
     pool, fake, _ = pool_of(ray_actors=1)
     fake.opened = Broke("broken", "ImportError: no newton", "a trace")

@@ -448,7 +448,7 @@ def second_process(arguments):
 
 @pytest.mark.release
 def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: both processes end with the same network and input statistics."""
+    """Both processes of a torchrun on the CPU end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
     flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "1", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
