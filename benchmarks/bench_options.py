@@ -98,7 +98,7 @@ class TrainingBenchOptions(PlainBenchOptions):
     weights: str = ""
     """Pretrained weights, as of a training."""
     graph: bool = True
-    """On CUDA: capture batch and step in one CUDA graph."""
+    """Capture batch and step in one CUDA graph, on CUDA."""
     compile: bool = False
     """Compile the network with torch.compile; not for pi05."""
     against_lerobot: bool = False
@@ -118,9 +118,9 @@ class DatasetBenchOptions(PlainBenchOptions):
     recordings: Several[Path] = ()
     """Folders of recorded episodes: they are built and verified once more, and the time is measured."""
     made: int = 0
-    """So many copies of the recordings under other seeds are built, verified and read instead of --dataset."""
+    """Number of copies of the recordings under other seeds that are built, verified and read instead of --dataset."""
     seed: int = 0
-    """Of the order in which pictures are read."""
+    """Seed of the order in which pictures are read."""
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | 
             raise InputError(f"{flag}: cannot read it without a value")
     missing = tyro.MISSING_NONPROP if default is None else default
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
+        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there becomes one line
             return tyro.cli(kind, args=arguments, prog=prog, default=missing)
     except SystemExit as stop:
         if stop.code in (0, None):

@@ -73,7 +73,7 @@ class ProtocolRun:
     protocol: str
     episodes: tuple[ProtocolEpisode, ...]
     seconds: float
-    """From its start to its end [s]."""
+    """Time from its start to its end [s]."""
     commands: tuple[str, ...] = ()
     """Command lines, as a user types them."""
 
@@ -86,7 +86,7 @@ class ProtocolRow:
     successes: int
     episodes: int
     steps: tuple[int, ...]
-    """Of each episode."""
+    """Steps of each episode."""
     same_endings: bool
     """Outcome, reason and steps of every episode are those of the first protocol."""
     same_actions: bool

@@ -296,7 +296,7 @@ class ResultsFolder:
         with contextlib.suppress(ArenaError, ValueError):
             write_atomic(self.path / BREAK_FILE, traceback.format_exc())
 
-    def sweep(self) -> None:
+    def remove_unfinished(self) -> None:
         """Remove what unfinished recordings left."""
         for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial", f"actions/*/*{PARTIAL}"):
             for part in self.path.glob(pattern):

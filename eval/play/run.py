@@ -183,7 +183,7 @@ def _play(
     folder.make()
     with Journal(folder.journal) as journal:
         folder.prepare(config, journal.records)
-        folder.sweep()
+        folder.remove_unfinished()
         run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:
             with naming_the_command(resume, run.kept):
@@ -196,7 +196,7 @@ def _play(
         except PolicyUnavailable as error:
             raise RunStopped(f"{error}; {run.kept()}; when it is back: {resume}") from None
         finally:
-            folder.sweep()
+            folder.remove_unfinished()
     return True
 
 

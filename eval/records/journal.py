@@ -86,7 +86,7 @@ class EpisodeRecord:
     max_steps: Ticks
     """Step budget."""
     hashes: Annotated[dict[Name, Name | None], Fit("hashes by name")] = field(default_factory=dict)
-    """Of configuration, rules, checkpoint, policy, variant, the libraries' versions and the environment."""
+    """Hashes of configuration, rules, checkpoint, policy, variant, the libraries' versions and the environment."""
     outcome: Outcome
     reason: Cause = ""
     """Finer cause, such as `startup_fall`."""

@@ -68,7 +68,7 @@ class _Cell:
     held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """Journal and status, while it is played."""
     error: ArenaError | None = None
-    """Why no more of it is dealt out."""
+    """Error after which no more of it is dealt out."""
     ended: bool = False
 
     @property
@@ -185,8 +185,8 @@ class _PoolPlayer(CellPlayer):
         with self.silence():
             journal = cell.held.enter_context(Journal(folder.journal))
             folder.prepare(config, journal.records)
-            folder.sweep()
-            cell.held.callback(folder.sweep)
+            folder.remove_unfinished()
+            cell.held.callback(folder.remove_unfinished)
             done, waiting = begun(config, folder, journal)
             if waiting:
                 cell.held.enter_context(folder.running())

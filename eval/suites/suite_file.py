@@ -53,7 +53,7 @@ TABLES = ("name", "defaults", "matrix", "checkpoints", "policies", "cells")
 LISTS = ("tasks", "trackers", "modes", "rules", "latency", "trained_on", "trained_tasks", "seeds")
 """Keys whose single value may be given without brackets."""
 SELECTORS = ("policy", "family", "trained_on", "tracker", "task", "mode", "rules", "labels", "latency", "matched")
-"""By what cells are chosen, in [[cells]] and in --only."""
+"""Keys by which cells are chosen, in [[cells]] and in --only."""
 PATTERNS = ("task", "tracker")
 """Names in braces that a policy's spec may hold."""
 MAX_LATENCY = 1000
@@ -86,7 +86,7 @@ class PolicyEntry:
     spec: str = ""
     """Value of --policy; `{task}` and `{tracker}` stand for task and tracker of its training."""
     family: str = ""
-    """Such as `act`; a checkpoint of ours says it itself."""
+    """Family of the policy, such as `act`; a checkpoint of ours names it itself."""
     trained_on: tuple[str, ...] = ()
     """Trackers of its demonstrations: with `{tracker}` in the spec one checkpoint for each, else one of all."""
     trained_tasks: tuple[str, ...] = ()

@@ -52,7 +52,7 @@ SMALLER = 4
 ALONE = 2
 """Losses after which an episode is played alone."""
 GIVEN_UP = 5
-"""So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
+"""Number of episodes of a task, tracker and mode that stop the run if they end as errors before one ends otherwise."""
 
 
 def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
@@ -87,8 +87,8 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
         folder.make()
         journal = ended.enter_context(Journal(folder.journal))
         folder.prepare(config, journal.records)
-        folder.sweep()
-        ended.callback(_swept, pool, folder)
+        folder.remove_unfinished()
+        ended.callback(_remove_unfinished, pool, folder)
         try:
             with naming_the_command(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal)
@@ -100,11 +100,11 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
     return True
 
 
-def _swept(pool: WorkerPool, folder: ResultsFolder) -> None:
+def _remove_unfinished(pool: WorkerPool, folder: ResultsFolder) -> None:
     """Remove what unfinished recordings left, once who writes them has ended."""
     if any(worker.assignment is not None for worker in pool.workers):
         pool.dismiss()
-    folder.sweep()
+    folder.remove_unfinished()
 
 
 def _play(run: DealtRun) -> None:

@@ -96,7 +96,7 @@ def make_policy(options: ServeOptions, device: torch.device) -> Policy:
     """The policy that is served, decoded to v3.1 unless its own labels are wanted.
 
     Raises:
-        InputError: There is no such policy, or it is of other labels than it is said to be.
+        InputError: There is no such policy, or its labels are others than the stated ones.
     """
     more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
     policy = get(options.policy, **more if options.policy.partition(":")[0] == "lerobot" else {})

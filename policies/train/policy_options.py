@@ -75,7 +75,7 @@ class PolicyTrainOptions:
     lr: float = field(default=0.0, metadata=bounds(0.0, 1.0))
     """Learning rate after the warm-up; 0: the recipe's."""
     seed: int | None = field(default=None, metadata=bounds(0, 2**31))
-    """Of weights, order, augmentation and noise; the recipe's by default."""
+    """Seed of weights, order, augmentation and noise; the recipe's by default."""
     device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
@@ -92,7 +92,7 @@ class PolicyTrainOptions:
     log_every: int = field(default=50, metadata=bounds(1))
     """Steps between rows of the log."""
     graph: bool = True
-    """On CUDA: capture batch and step in one CUDA graph."""
+    """Capture batch and step in one CUDA graph, on CUDA."""
     compile: bool = False
     """Compile the network with torch.compile, which takes a minute or so at the first step; not for pi05."""
     jobs: int = field(default=0, metadata=bounds(0, 1024))
@@ -122,7 +122,7 @@ class TeachableOptions:
     chunk: int = field(default=20, metadata=bounds(1, 1000))
     """Actions of an answer, which are executed whole."""
     seed: int = field(default=0, metadata=bounds(0, 2**31))
-    """Of weights, order and noise."""
+    """Seed of weights, order and noise."""
     episodes: int = field(default=30, metadata=bounds(1, 1000))
     """Episodes that are played, spread over the protocol's group seeds 0 1 2."""
     worlds: int = field(default=30, metadata=bounds(1, 4096))

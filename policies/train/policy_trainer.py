@@ -86,7 +86,7 @@ class PolicyTrainer:
         self._order = self._ordered(weights)
         names = store.pair_names
         self._sums = torch.zeros((len(names), 2), device=self.device) if len(names) > 1 else None
-        """Of each pair since the last reading: losses of its samples, and their number."""
+        """Losses of each pair's samples since the last reading, summed, and their number."""
         self.drawn = dict.fromkeys(names if len(names) > 1 else (), 0)
         """Pair → samples of this process, since the training began or went on, up to the last reading."""
         self._rows = torch.zeros(recipe.batch_size, dtype=torch.int64, device=self.device)

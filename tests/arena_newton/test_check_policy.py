@@ -253,7 +253,7 @@ def test_each_check_finds_its_fault(broken):
 
 @pytest.mark.parametrize("cameras", [["front"], {"front": "ego"}])
 def test_cameras_are_named_configurations(cameras):
-    """Cameras that are no mapping of names to configurations are said to be that."""
+    """Cameras that are no mapping of names to configurations are reported as that."""
     policy = Swaying()
     policy.cameras = cameras
     with pytest.raises(ConformanceError, match="cameras is no mapping of names to CameraConfig"):

@@ -24,7 +24,7 @@ def found(findings, subject):
 
 
 def test_modules_are_tried_in_another_process(tmp_path, monkeypatch):
-    """A module that imports has no fault; one that does not, crashes or hangs is told, in their order."""
+    """A module that imports has no fault; one that does not, crashes or hangs is reported, in their order."""
     (tmp_path / "dies_at_once.py").write_text("import os\nos.abort()\n")
     (tmp_path / "never_ends.py").write_text("import time\ntime.sleep(100)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

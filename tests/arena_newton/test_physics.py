@@ -319,7 +319,7 @@ over "World"
 
 
 def test_a_scene_is_the_same_however_often_it_was_built(monkeypatch):
-    """From an import that is kept, with other drives in between, MuJoCo's model is that of the first, byte for byte."""
+    """MuJoCo's model from a kept import, with other drives in between, is that of the first, byte for byte."""
     monkeypatch.setattr(scene_file, "_OWN", {})
 
     def model(**options):

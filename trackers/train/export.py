@@ -1,4 +1,4 @@
-"""From a training checkpoint to the weights file of a tracker and its card."""
+"""Export of a training checkpoint to the weights file of a tracker and its card."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -101,7 +101,8 @@ class TrainOptions:
     """Target KL divergence per iteration (adaptive learning rate)."""
     entropy: float = field(default=0.0015, metadata=bounds(0))
     """Entropy coefficient."""
-    settle: float = field(default=0.0, metadata=bounds(0, 1))
+    # `--settle` in the commands of earlier cards.
+    anneal: Annotated[float, tyro.conf.arg(aliases=("--settle",))] = field(default=0.0, metadata=bounds(0, 1))
     """Final fraction of `--minutes` over which target KL and entropy coefficient are annealed to 10 %."""
     init_std: float = field(default=0.5, metadata=bounds(1e-3, 10))
     """Initial standard deviation of the action noise."""
@@ -112,7 +113,7 @@ class TrainOptions:
     keep_last: int = field(default=3, metadata=bounds(0))
     """Number of latest checkpoints that are kept, 0 = all."""
     keep_every: int = field(default=10, metadata=bounds(0))
-    """Of the older ones every n-th is kept, 0 = none."""
+    """Interval of the older ones that are kept: every n-th, 0 = none."""
     print_interval: int = field(default=20, metadata=bounds(1))
     """Iterations between printed lines."""
     log_interval: int = field(default=5, metadata=bounds(1))
@@ -178,8 +179,8 @@ def check(options: TrainOptions) -> None:
     """
     check_bounds(options)
     check_number("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
-    if options.settle > 0.0 and options.minutes <= 0.0:
-        raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
+    if options.anneal > 0.0 and options.minutes <= 0.0:
+        raise InputError(f"--anneal {options.anneal}: a fraction of --minutes, which is not given")
     if options.resume is not None and options.start_from is not None:
         raise InputError("--resume continues a training, --start-from begins one: pass one of the two")
     if options.library is not None and options.families:

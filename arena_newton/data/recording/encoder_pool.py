@@ -279,7 +279,7 @@ class EncoderPool(VideoEncoder):
         self._workers, self._cameras, self._open = [], {}, [0] * self._count
 
     def _send(self, worker: _Worker, message: Mapping[str, object]) -> None:
-        """Say something after all that was said before; pictures are told when they are there."""
+        """Send a message after all earlier ones, of which those of pictures wait until the pictures are there."""
         self._unsent.append((None, [(worker, packed(message))]))
         self._flush()
 

@@ -46,7 +46,7 @@ RAY_MINUTES = 60.0
 POLL = 0.2
 """The journal is looked at so often [s]."""
 ENDING = 60.0
-"""Time for the cluster to end when it is told to [s]."""
+"""Time for the cluster to end after its stop is requested [s]."""
 PROGRAM = "arena_newton.eval"
 """Module that plays on a cluster."""
 ACTOR = b"ray::RayActor.play"

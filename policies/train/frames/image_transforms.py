@@ -96,7 +96,7 @@ def _saturation(pictures: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 
 
 def _hue(pictures: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """To hue, saturation and value, and back with another hue."""
+    """Convert to hue, saturation and value, and back with another hue."""
     low, high = pictures.aminmax(dim=1, keepdim=True)
     span = torch.where(high == low, 1.0, high - low)
     to_red, to_green, to_blue = ((high - pictures) / span).split(1, dim=1)

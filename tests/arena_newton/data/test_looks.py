@@ -58,7 +58,7 @@ def test_bytes_name_shapes_and_their_objects():
 
 
 def test_second_lights_are_never_those_of_visual_mode():
-    """Of 4,000 lights none comes from within 5° of any direction of visual mode, and domes are none of its lights."""
+    """None of 4,000 lights comes from within 5° of any direction of visual mode, and domes are none of its lights."""
     steep = [draw_light(seed, LightRange()) for seed in range(4000)]
     widest = max(np.degrees(np.arccos(-light.direction[2])) for light in steep)
     assert visual_angle() - 2.0 < widest <= visual_angle()

@@ -256,7 +256,7 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
 
 @pytest.mark.release
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
+    """Both processes of a torchrun on the CPU hold the same weights at each checkpoint, which the first writes."""
     out, agreed = tmp_path / "run", []
     check = PolicyTrainer.check_agreement
     monkeypatch.setattr(PolicyTrainer, "check_agreement", lambda self: (check(self), agreed.append(self.step)))
