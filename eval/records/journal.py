@@ -13,7 +13,7 @@ import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Protocol, Self
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records.episode_signals import EpisodeSignals
@@ -29,6 +29,7 @@ __all__ = [
     "JOURNAL_FILE",
     "SCHEMA",
     "ContradictionError",
+    "EpisodeLines",
     "EpisodeRecord",
     "Journal",
     "LockedLines",
@@ -301,6 +302,15 @@ class Journal(LockedLines):
         self.append_line(line, f"kept: {counted(kept, 'episode')}")
         self.records.append(linked)
         self._last = line
+
+
+class EpisodeLines(Protocol):
+    """Sink of finished episodes: the journal, or what passes them on to it."""
+
+    records: list[EpisodeRecord]
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Take the record of an episode that ended."""
 
 
 def write_atomic(path: Path, text: str, kept: str = "the journal is kept") -> None:
