@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arena_newton.cli.flags import Several
-from arena_newton.policies.train.policy_options import bounds
+from arena_newton.cli.flags import Device, Several, bounds
 
 __all__ = [
     "CameraBenchOptions",
@@ -95,8 +94,7 @@ class TrainingBenchOptions(PlainBenchOptions):
     """Time of each measurement [s], after the warm-up."""
     batch_size: int = field(default=0, metadata=bounds(0, 65536))
     """Samples of a step; 0: the recipe's."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N or auto."""
+    device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights, as of a training."""
     graph: bool = True

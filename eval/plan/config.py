@@ -232,6 +232,11 @@ class RunConfig:
             policy_facts=_facts(policy) | ({"privileged": True} if is_privileged(policy) else {}),
         )
 
+    def described_by(self, other: object) -> RunConfig:
+        """The run with what trackers and policy say of themselves, of a run or a message that has them."""
+        described = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in described})
+
 
 def _facts(part: Tracker | Policy) -> JsonObject:
     """Own description of a tracker or policy, and the hash of its code if it is of another package, as JSON."""

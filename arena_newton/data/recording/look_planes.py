@@ -17,8 +17,9 @@ import warp as wp
 from arena_newton.data.readers.looks import FIRST_SHAPE, MOST_SHAPES, Looks
 from arena_newton.errors import InputError
 from arena_newton.interfaces import World
-from arena_newton.pictures.camera import DOME_INTENSITY, Camera, WorldLights
+from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.changed_looks import luminance
+from arena_newton.pictures.settings import DOME_INTENSITY
 from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import LightDraw
 

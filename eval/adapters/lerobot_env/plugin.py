@@ -16,6 +16,7 @@ from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
 from arena_newton.pictures.settings import CAMERAS, CameraConfig, Fit
+from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ArenaNewtonEnv", "DropRepeated"]
 
-LABELS = ("v3.1", "v4")
-"""Label protocols, `data.readers.label_protocols.LABELS`."""
 FPS = 50
 """Ticks per second."""
 REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")

@@ -2,11 +2,11 @@
 
 import contextlib
 import json
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -117,13 +117,13 @@ def here(monkeypatch, kept_worlds):
     """The programs of protocols run in this process, by their command lines; gives their exit codes."""
     codes = []
 
-    def call(command, *, stdout, **_):
-        assert command[:4] == [sys.executable, "-P", "-m", "arena_newton.eval"]
-        with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stdout):
-            codes.append(main(command[4:], Factories(env=kept_worlds)))
-        return SimpleNamespace(returncode=codes[-1])
+    def start(module, *arguments, output, **_):
+        assert module == "arena_newton.eval"
+        with os.fdopen(os.dup(output), "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+            codes.append(main(arguments, Factories(env=kept_worlds)))
+        return subprocess.Popen(["sh", "-c", f"exit {codes[-1]}"])
 
-    monkeypatch.setattr(protocol_comparison, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": call}))
+    monkeypatch.setattr(protocol_comparison, "start_module", start)
     return codes
 
 
@@ -147,14 +147,42 @@ def test_our_runner_alone(checkpoint, tmp_path, here):
     assert row["steps"] == [TICKS] and row["episodes"] == len(here) == 1 and row["promised"]
 
 
-def test_a_protocol_is_a_program(tmp_path):
+def program(folder, monkeypatch, text):
+    """Name of a module with this text, and the file of what it prints."""
+    (folder / "made_program.py").write_text(f"import os, signal, sys, time\n{text}")
+    monkeypatch.syspath_prepend(folder)
+    return ["made_program"], folder / "log"
+
+
+def test_a_protocol_is_a_program(tmp_path, monkeypatch):
     """It runs with one thread, what it prints goes into a file, and its exit code counts."""
-    program = "import os, sys; print('said', os.environ['MKL_NUM_THREADS'], flush=True); sys.exit('lost')"
-    log = tmp_path / "log"
-    protocol_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0, 1))
+    command, log = program(
+        tmp_path, monkeypatch, "print('said', os.environ['MKL_NUM_THREADS'], flush=True)\nexit('lost')"
+    )
+    protocol_comparison._call("openpi", command, log, (0, 1))
     assert log.read_text() == "said 1\nlost\n"
     with pytest.raises(InputError, match=f"protocol openpi: exit code 1, lost; all of it is in {log}"):
-        protocol_comparison._call("openpi", [sys.executable, "-S", "-c", program], log, (0,))
+        protocol_comparison._call("openpi", command, log, (0,))
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_a_server_ends_with_its_protocol(tmp_path, monkeypatch, deaf):
+    """It is asked by the address that it prints, and ended by Ctrl-C, or killed where it does not hear."""
+    monkeypatch.setattr(protocol_comparison, "END_S", 0.3 if deaf else 30.0)
+    hears = "signal.signal(signal.SIGINT, signal.SIG_IGN if deaf else lambda *_: (print('bye', flush=True), exit()))"
+    text = f"deaf = {deaf}\n{hears}\nprint('{protocol_comparison.ADDRESS}openpi:here', flush=True)\ntime.sleep(60)"
+    command, log = program(tmp_path, monkeypatch, text)
+    with protocol_comparison._server("openpi", command, log) as spec:
+        assert spec == "openpi:here"
+    assert log.read_text().splitlines()[1:] == ([] if deaf else ["bye"])
+
+
+def test_a_server_that_does_not_listen_is_named(tmp_path, monkeypatch):
+    """Its last line is in the error, as soon as it has ended."""
+    command, log = program(tmp_path, monkeypatch, "exit('no room')")
+    with pytest.raises(InputError, match="protocol openpi: its server does not listen, no room; all of it"):
+        with protocol_comparison._server("openpi", command, log):
+            pass
 
 
 def argv(monkeypatch, checkpoint, *flags):

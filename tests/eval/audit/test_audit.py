@@ -96,6 +96,15 @@ def test_honest_folders_are_not_accused(honest, tmp_path, capsys):
     assert all(level in page and level in content for level in ("self-reported", "consistent", "replayed", "re-run"))
 
 
+def test_each_tracker_plays_its_own_episodes_again(honest, tmp_path, capsys):
+    """A replay of a run through two trackers meets all of its lines; one without actions has nothing to play."""
+    assert main(["audit", str(honest / "run"), "--all"], factories()) == 0
+    assert "replayed 40 of 40, contradictions 0" in capsys.readouterr().out
+    bare = shutil.copytree(honest / "run", tmp_path / "bare", ignore=shutil.ignore_patterns("actions"))
+    assert main(["audit", str(bare), "--replay", "2"], factories()) == 0
+    assert "replayed 0 of 40" in capsys.readouterr().out
+
+
 def test_older_journals_are_marked(tmp_path, capsys):
     """A folder of every older version is read and reported as unchained."""
     for schema in (1, 2):

@@ -23,7 +23,7 @@ def stand_in(tmp_path, monkeypatch, code=0):
     log, program = tmp_path / "log", tmp_path / "python"
     program.write_text(f'#!/bin/sh\necho "$@" >> {log}\necho "error: broken" >&2\nexit {code}\n')
     program.chmod(0o755)
-    monkeypatch.setattr(jobs.sys, "executable", str(program))
+    monkeypatch.setattr(sys, "executable", str(program))
     return log
 
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 from eval_fakes import factories
@@ -17,8 +16,6 @@ from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import machines
 from arena_newton.eval.certification.checks.same_files import contents
 from arena_newton.eval.workers.shard_merge import merge
-
-FAKES = Path(__file__).parents[1] / "fakes_by_name.py"
 
 
 def certified(folder, check, **changes):
@@ -206,7 +203,7 @@ def test_contents_of_a_folder(tmp_path):
 def test_a_real_cluster_loses_an_actor(tmp_path, monkeypatch):
     """A Ray cluster on this machine plays stand-ins, an actor is killed, and all files are those of one process."""
     pytest.importorskip("ray", reason="needs the extra [ray]")
-    monkeypatch.setattr(machines, "COMMAND", (sys.executable, str(FAKES)))
+    monkeypatch.setattr(machines, "PROGRAM", "fakes_by_name")
     monkeypatch.setenv("FAKE_TICK_S", "0.05")
     code, found = certified(tmp_path, "ray")
     assert code == 0 and found["verdict"] == "pass", found

@@ -12,7 +12,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.env_cache import EnvCache
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.run_flow import group_of
-from arena_newton.eval.suites.suite_records import read_suite
+from arena_newton.eval.suites.suite_records import read_events, read_suite
 
 SUITE = """
 [defaults]
@@ -23,25 +23,28 @@ max_steps = 12
 engine = "mujoco"
 [matrix]
 tasks = ["boxing"]
+modes = ["base", "visual", "execution"]
 [[policies]]
 name = "expert"
 spec = "expert"
 [[policies]]
 name = "still"
+modes = "base"
 spec = "stand"
 [[policies]]
 name = "again"
 spec = "expert"
+modes = "base"
 """
 
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """Folder of a suite of three cells that were played in one environment, and that environment's cache."""
+    """Folder of a suite of five cells that were played in one environment, and that environment's cache."""
     folder = tmp_path_factory.mktemp("suite")
-    (folder / "three.toml").write_text(SUITE)
+    (folder / "five.toml").write_text(SUITE)
     cache = EnvCache()
-    assert main(["matrix", str(folder / "three.toml"), "--out", str(folder / "out")], Factories(env=cache)) == 0
+    assert main(["matrix", str(folder / "five.toml"), "--out", str(folder / "out")], Factories(env=cache)) == 0
     cache.drop()
     return folder / "out", cache
 
@@ -56,7 +59,7 @@ def test_episodes_do_not_know_what_ran_before(played, tmp_path):
     """A cell in a used environment equals a run in one of its own, bit for bit, and one environment was built."""
     out, cache = played
     assert cache.built == 1
-    assert [cell.status for cell in read_suite(out).cells] == ["done"] * 3
+    assert [cell.status for cell in read_suite(out).cells] == ["done"] * 5
     flags = "--task boxing --seeds 0 --repeats 3 --worlds 2 --max-steps 12 --engine mujoco --policy stand".split()
     assert main(["run", *flags, "--out", str(tmp_path / "alone")]) in (0, 1)
     alone = ends(tmp_path / "alone" / "episodes.jsonl")
@@ -79,11 +82,11 @@ def modes(kept_worlds, tmp_path_factory):
     return play
 
 
-def lines(*folders):
-    """Lines of journals without numbers of the plan, times and hash of the plan, by mode and repeat."""
+def lines(*folders, but=("index",)):
+    """Lines of journals without some keys, times and hash of the plan, by mode and repeat."""
     found = [json.loads(line) for at in folders for line in (at / "episodes.jsonl").read_text().splitlines()]
     for line in found:
-        for key in ("index", "durations", "started_at", "finished_at", "previous"):
+        for key in (*but, "durations", "started_at", "finished_at", "previous"):
             del line[key]
         del line["hashes"]["config"]
     return sorted(found, key=lambda line: (line["mode"], line["repeat"]))
@@ -101,6 +104,23 @@ def test_modes_of_one_scene_play_in_one_batch(modes):
         assert (together / name).read_bytes() == written, name
     environments = json.loads((together / "config.json").read_text())["environments"]
     assert list(environments) == [f"boxing twist2 {mode}" for mode in ("base", "visual", "execution")]
+
+
+def test_cells_of_one_scene_play_in_one_batch(played, modes):
+    """Cells of a suite in three modes have the lines and actions, bit for bit, of runs of one mode each."""
+    out, _ = played
+    names = ("base", "visual", "execution")
+    cells = [out / f"expert/twist2/boxing/{name}" for name in names]
+    alone = [modes(name, name) for name in names]
+    pictures = ("media", "video")
+    assert lines(*cells, but=pictures) == lines(*alone, but=pictures) and len(lines(*cells)) == 9
+    for cell, run in zip(cells, alone, strict=True):
+        files = {path.name: path.read_bytes() for path in (cell / "actions").iterdir()}
+        assert files == {path.name: path.read_bytes() for path in (run / "actions").iterdir()} and len(files) == 3
+        assert json.loads((cell / "config.json").read_text())["config"]["mode"] == [cell.name]
+    began = [event.cell for event in read_events(out) if event.event == "begun"][:3]
+    ended = next(number for number, event in enumerate(read_events(out)) if event.event == "done")
+    assert began == [f"expert/twist2/boxing/{name}" for name in names] and ended == 3
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from made_folders import SUITE, WIDE, journals
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.folders import joined_folders
 from arena_newton.eval.suites import suite_run
 from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_only, run_options, selected
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
@@ -170,6 +171,25 @@ def test_a_kill_at_any_moment_loses_nothing(suite, played, tmp_path, monkeypatch
         assert all(len(load_cell(read_suite(out), cell).records) == 4 for cell in done)
     assert call(suite, out, *only) == 0
     assert journals(out) == {name: journals(played)[name] for name in journals(out)} and len(journals(out)) == 2
+
+
+def test_files_are_with_their_cells(suite, played, tmp_path, monkeypatch):
+    """Actions are in the folder of their own mode, and none is left elsewhere by Ctrl-C before its line was written."""
+
+    def actions(out):
+        return {path.relative_to(out).as_posix() for path in out.glob("expert/twist2/boxing/**/*.npz")}
+
+    def interrupt(written, to):
+        assert written.is_file()
+        raise KeyboardInterrupt
+
+    out, only = tmp_path / "out", ("--only", "task=boxing policy=expert")
+    with monkeypatch.context() as patch:
+        patch.setattr(joined_folders, "_move", interrupt)
+        assert call(suite, out, *only) == 130
+    assert {path.split("/")[3] for path in actions(out)} == {"base"} and not list(out.rglob("*_visual_s*"))
+    assert call(suite, out, *only) == 0
+    assert actions(out) == actions(played) and len(actions(out)) == 8
 
 
 def test_limit_and_only_play_their_cells(suite, tmp_path, capsys):

@@ -10,7 +10,6 @@ from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.suites.matrix_cells import check_policies, expand_cells
-from arena_newton.eval.suites.suite_file import LABELS as KNOWN_LABELS
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file, suite_path
 from arena_newton.eval.suites.suite_records import (
     CellEvent,
@@ -22,6 +21,7 @@ from arena_newton.eval.suites.suite_records import (
     suite_json,
 )
 from arena_newton.policies.base import POLICIES
+from arena_newton.policies.chunk_flags import LABELS as KNOWN_LABELS
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from tests.fuzz.mutants import damaged
 
@@ -36,7 +36,7 @@ def read(tmp_path, text):
 
 
 def test_labels_are_those_of_the_product():
-    """Labels that a suite may name are the label protocols."""
+    """Labels that a flag or a suite may name are the label protocols."""
     assert set(KNOWN_LABELS) == set(LABELS)
 
 

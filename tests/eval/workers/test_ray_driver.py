@@ -77,7 +77,7 @@ def driven(tmp_path):
         pool = StubPool(job, size, lost, made_of)
         with Journal(folder.journal) as journal:
             folder.prepare(config, journal.records)
-            done, waiting = begun(config, folder, journal)
+            done, waiting = begun(config, folder, journal.records)
             dealing._play(dealing.DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         return read_journal(folder.journal)[0], pool, folder
 

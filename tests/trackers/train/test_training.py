@@ -274,11 +274,11 @@ def test_export_takes_fitting_figures_only(trained, tmp_path):
     figure = {"name": "falls", "bar": "no", "value": "0/8", "verdict": "pass"}
     document = {"options": {"engine": "mujoco", "rollouts": 8}, "trackers": [{"name": "sonic", "figures": [figure]}]}
     for text, words in (
-        ("[1]", "not an evaluation.json"),
+        ("[1]", "holds list, expected an object"),
         ('{"trackers": [{}]}', "not an evaluation.json"),
         (json.dumps(document), "other trackers than twist2"),
-        ("{", "not a readable JSON file"),
-        ("[" * 100_000, "not a readable JSON file"),
+        ("{", "not readable as JSON"),
+        ("[" * 100_000, "not readable as JSON"),
     ):
         metrics.write_text(text)
         with pytest.raises(InputError, match=words):
