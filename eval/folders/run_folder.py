@@ -172,7 +172,7 @@ class ResultsFolder:
 
     @contextlib.contextmanager
     def opened(self, config: RunConfig) -> Iterator[EpisodeLines]:
-        """The journal of the folder, made where it is new, prepared for the run; what is unfinished is removed when the block ends.
+        """The journal of the folder, which is made and prepared for the run; what is unfinished is removed at the end.
 
         `config` has what tracker and policy say of themselves. A torn last line is cut.
 
