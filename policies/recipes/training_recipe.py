@@ -340,6 +340,7 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
     ("*", "compact"): _FAST,
     ("act", "compact"): {
         "batch_norm": True,
+        "frozen_norms": 0.3,
         "cut_pad": True,
         "use_task_vector": True,
         "network": {
