@@ -63,40 +63,48 @@ def replay(audit: Audit, records: Sequence[EpisodeRecord], factories: Factories 
         raise InputError(f"{where} was played on engine {shown(run.config.get('engine'))}; {ENGINE} alone repeats bits")
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
-    wanted = {(r.task, r.tracker, r.mode, r.group_seed, r.repeat): r for r in records}
-    for tracker in dict.fromkeys(record.tracker for record in records):
-        names = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping), "task", "seeds", "repeats", "checkpoint")
-        actions = run.folder / actions_folder(stored.tracker, tracker)
-        flags = {name: getattr(stored, name) for name in names}
-        flags |= {"tracker": (tracker,), "policy": f"replay:{actions}", "engine": ENGINE, "actions": False}
-        config = resolve(RunOptions(**flags))
-        chosen = [e for e in config.episodes if (e.task, tracker, e.mode, e.group_seed, e.repeat) in wanted]
-        config, policy = check_parts(dataclasses.replace(config, episodes=tuple(chosen)), made)
-        installed = config.identity()
-        for key in ("code", "scenes", "rules_hash"):
-            if installed.get(key) != run.config.get(key):
-                audit.notes.append(f"Replayed with another {key} than the run's: what differs may come of that.")
-        try:
-            for group in groups(chosen).values():
-                env = make_env(config, made, group[0], min(config.flags.worlds, len(group)))
-                try:
-                    results: list[EpisodeResult] = []
-                    Rollout(env, policy, group, max_steps=group[0].max_steps, on_finish=results.append).run()
-                finally:
-                    env.close()
-                for result in results:
-                    episode: Episode = result.episode
-                    _compare(
-                        audit, wanted[episode.task, tracker, episode.mode, episode.group_seed, episode.repeat], result
-                    )
-        finally:
-            policy.close()
+    if records:
+        _play(audit, stored, records, made)
     audit.replayed = len(records)
     found = 1.0 - (1.0 - FORGED) ** len(records)
     sure = (
         "any forged line" if len(records) == len(run.records) else f"one of {FORGED:.0%} forged lines with {found:.0%}"
     )
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
+
+
+def _play(audit: Audit, stored: RunOptions, records: Sequence[EpisodeRecord], made: Factories) -> None:
+    """Play these episodes of a folder's plan, and compare each."""
+    run, wanted = audit.run, {_key(record): record for record in records}
+    names = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping), "task", "seeds", "repeats", "checkpoint")
+    flags = {name: getattr(stored, name) for name in names} | {"tracker": stored.tracker, "engine": ENGINE}
+    plan = resolve(RunOptions(**flags | {"policy": f"replay:{run.folder / 'actions'}", "actions": False}))
+    installed = plan.identity()
+    for key in ("code", "scenes", "rules_hash"):
+        if installed.get(key) != run.config.get(key):
+            audit.notes.append(f"Replayed with another {key} than the run's: what differs may come of that.")
+    for tracker in dict.fromkeys(record.tracker for record in records):
+        actions = run.folder / actions_folder(stored.tracker, tracker)
+        chosen = tuple(episode for episode in plan.episodes if episode.tracker == tracker and _key(episode) in wanted)
+        own = dataclasses.replace(plan.flags, tracker=(tracker,))
+        config = dataclasses.replace(plan, flags=own, policy=f"replay:{actions}", episodes=chosen)
+        config, policy = check_parts(config, made)
+        try:
+            for group in groups(chosen).values():
+                env = make_env(config, made, group[0], min(own.worlds, len(group)))
+                try:
+                    results: list[EpisodeResult] = []
+                    Rollout(env, policy, group, max_steps=group[0].max_steps, on_finish=results.append).run()
+                finally:
+                    env.close()
+                for result in results:
+                    _compare(audit, wanted[_key(result.episode)], result)
+        finally:
+            policy.close()
+
+
+def _key(one: EpisodeRecord | Episode) -> tuple[object, ...]:
+    return one.task, one.tracker, one.mode, one.group_seed, one.repeat
 
 
 def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult) -> None:

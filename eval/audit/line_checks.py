@@ -172,13 +172,13 @@ def action_faults(run: RunRecord, records: Sequence[EpisodeRecord], lacking: lis
             continue
         if hashlib.sha256(data).hexdigest() != record.actions:
             yield f"{run.folder / path}: is not the file whose hash episode {record.index} names"
-        if (seed := _seed_of(run.folder / path)) != record.episode_seed:
+        if (seed := _seed_of(run.folder / path, data)) != record.episode_seed:
             yield f"{run.folder / path}: is of seed {seed}, episode {record.index} has {record.episode_seed}"
 
 
-def _seed_of(path: Path) -> int | None:
+def _seed_of(path: Path, content: bytes) -> int | None:
     """Episode seed that a file of actions names, by which a replay knows it; None where it names none."""
     try:
-        return int(read_arrays(path, ("episode_seed",))["episode_seed"])
+        return int(read_arrays(path, ("episode_seed",), content=content)["episode_seed"])
     except (InputError, KeyError, TypeError, ValueError):
         return None

@@ -172,7 +172,7 @@ class ResultsFolder:
 
     @contextlib.contextmanager
     def opened(self, config: RunConfig) -> Iterator[EpisodeLines]:
-        """The journal of the folder, made where it is new, prepared for the run, and swept when the block ends.
+        """The journal of the folder, prepared for the run; what is unfinished is removed at the end of the block.
 
         `config` has what tracker and policy say of themselves. A torn last line is cut.
 
@@ -183,7 +183,7 @@ class ResultsFolder:
         self.make()
         with Journal(self.journal) as journal:
             self.prepare(config, journal.records)
-            self.sweep()
+            self.remove_unfinished()
             if journal.torn_bytes:
                 print(
                     f"  cut a torn last line of {counted(journal.torn_bytes, 'byte')} off the journal", file=sys.stderr
@@ -191,7 +191,7 @@ class ResultsFolder:
             try:
                 yield journal
             finally:
-                self.sweep()
+                self.remove_unfinished()
 
     def make(self) -> None:
         """Create the folder.
@@ -325,7 +325,7 @@ class ResultsFolder:
         with contextlib.suppress(ArenaError, ValueError):
             write_atomic(self.path / BREAK_FILE, traceback.format_exc())
 
-    def sweep(self) -> None:
+    def remove_unfinished(self) -> None:
         """Remove what unfinished recordings left."""
         for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial", f"actions/*/*{PARTIAL}"):
             for part in self.path.glob(pattern):

@@ -69,7 +69,7 @@ class _Cell:
     held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """Journal and status, while it is played."""
     error: ArenaError | None = None
-    """Why no more of it is dealt out."""
+    """Error after which no more of it is dealt out."""
     ended: bool = False
 
     @property

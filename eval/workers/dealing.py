@@ -51,7 +51,7 @@ SMALLER = 4
 ALONE = 2
 """Losses after which an episode is played alone."""
 GIVEN_UP = 5
-"""So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
+"""Number of episodes of a task, tracker and mode that stop the run if they end as errors before one ends otherwise."""
 
 
 def execute(folders: Sequence[ResultsFolder], factories: Factories | None = None) -> int:

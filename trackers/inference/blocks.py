@@ -56,7 +56,7 @@ class OnnxProduct:
     """A network in ONNX Runtime: rows in, rows out."""
 
     def __init__(self, graph: bytes, threads: int = 1):
-        """Of a file with one input, `obs`, and one output, `action`, on some threads."""
+        """Make one of a file with one input, `obs`, and one output, `action`, on some threads."""
         self._session = onnxruntime.InferenceSession(
             graph, session_options(threads), providers=["CPUExecutionProvider"]
         )
