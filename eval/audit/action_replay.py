@@ -1,33 +1,45 @@
-"""Episodes of a results folder played again on engine mujoco, from their actions alone, and compared bit for bit."""
+"""Episodes of a results folder played again on engine mujoco, from their actions alone, and compared bit for bit.
+
+What the policy was shown is drawn again at its queries; a policy is asked again there, and its answers are compared.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from arena_newton.errors import InputError
+from arena_newton.eval.audit.asked_again import AskedAgain, RecordedQueries
 from arena_newton.eval.audit.folder_audit import Audit
-from arena_newton.eval.folders.run_folder import actions_folder, stored_options
-from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
+from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.plan.options import Batch, Conditions, RunOptions, Stepping, flags_of
+from arena_newton.eval.plan.options import Batch, Chunks, Conditions, Remote, RunOptions, Stepping, flags_of
 from arena_newton.eval.play.run import Factories, check_parts, make_env
 from arena_newton.eval.play.run_flow import groups
+from arena_newton.eval.records.document import CONFIG_FILE
+from arena_newton.eval.records.identity import differing_key
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
-from arena_newton.files.stored_json import shown
+from arena_newton.files.stored_json import loaded, shown
 from arena_newton.files.text import counted
-from arena_newton.interfaces import EpisodeResult
+from arena_newton.interfaces import EpisodeResult, Recorder
+from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
+from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
 
-__all__ = ["drawn", "replay"]
+__all__ = ["ENGINE", "drawn", "found_probability", "replay", "rollout_flags", "stored_cameras"]
 
 COMPARED = "outcome reason steps margin startup_fall overflow predicates progress events".split()
 """Keys of a line that a replay must give again, numbers to the last bit."""
+EVIDENCE = ("final_state", "shown")
+"""Hashes of a line that it must give again, where the line has them."""
 ENGINE = "mujoco"
-FORGED = 0.1
-"""Fraction of forged lines for which a note says how probably the drawn episodes find one."""
+FORGED = (0.01, 0.05, 0.1, 0.25)
+"""Fractions of forged lines for which an audit says how probably the drawn episodes find one."""
+MOST_SAMPLES = 4
+"""Most rays per pixel along each axis of a stored camera that is drawn again."""
 
 
 def drawn(audit: Audit, count: int | None, seed: int) -> list[EpisodeRecord]:
@@ -46,13 +58,36 @@ def drawn(audit: Audit, count: int | None, seed: int) -> list[EpisodeRecord]:
     return [candidates[number] for number in sorted(chosen)]
 
 
-def replay(audit: Audit, records: Sequence[EpisodeRecord], factories: Factories | None = None) -> None:
+def found_probability(forged: float, episodes: int) -> float:
+    """Probability that one of so many drawn episodes is of a fraction of forged lines."""
+    return 1.0 - (1.0 - forged) ** episodes
+
+
+def rollout_flags(stored: RunOptions, tracker: str, policy: str, *kinds: type) -> dict[str, object]:
+    """Flags by which a run through one tracker is played here with a policy, with those of more kinds."""
+    more = (*flags_of(Remote),) if policy.startswith("remote:") else ()
+    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
+    names = (*groups_of, *more, "task", "seeds", "repeats", "checkpoint")
+    same = {name: getattr(stored, name) for name in names}
+    return same | {"policy": policy, "tracker": (tracker,), "engine": ENGINE, "actions": False}
+
+
+def replay(
+    audit: Audit,
+    records: Sequence[EpisodeRecord],
+    factories: Factories | None = None,
+    *,
+    policy: str | None = None,
+    tolerance: float = 0.0,
+) -> None:
     """Play episodes again, and add what differs to the audit's contradictions.
 
     Args:
         audit: Of their folder.
         records: The episodes.
-        factories: What worlds and trackers are made with; the real ones by default.
+        factories: What worlds, trackers and policies are made with; the real ones by default.
+        policy: Spec of a policy to ask again at the recorded queries.
+        tolerance: Largest difference of an action that is still the policy's.
 
     Raises:
         InputError: They were not played on engine mujoco, are demonstrations, or cannot be played here.
@@ -64,45 +99,113 @@ def replay(audit: Audit, records: Sequence[EpisodeRecord], factories: Factories 
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
     wanted = {(r.task, r.tracker, r.mode, r.group_seed, r.repeat): r for r in records}
+    largest, compared, equal = 0.0, 0, 0
     for tracker in dict.fromkeys(record.tracker for record in records):
-        names = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping), "task", "seeds", "repeats", "checkpoint")
         actions = run.folder / actions_folder(stored.tracker, tracker)
-        flags = {name: getattr(stored, name) for name in names}
-        flags |= {"tracker": (tracker,), "policy": f"replay:{actions}", "engine": ENGINE, "actions": False}
-        config = resolve(RunOptions(**flags))
+        config = resolve(RunOptions(**rollout_flags(stored, tracker, f"replay:{actions}")))  # type: ignore[arg-type]
         chosen = [e for e in config.episodes if (e.task, tracker, e.mode, e.group_seed, e.repeat) in wanted]
-        config, policy = check_parts(dataclasses.replace(config, episodes=tuple(chosen)), made)
-        installed = config.identity()
-        for key in ("code", "scenes", "rules_hash"):
-            if installed.get(key) != run.config.get(key):
-                audit.notes.append(f"Replayed with another {key} than the run's: what differs may come of that.")
+        config, player = check_parts(dataclasses.replace(config, episodes=tuple(chosen)), made)
+        _note_differences(audit, config, ("code", "scenes", "rules_hash"))
+        again: Policy | None = None
         try:
-            for group in groups(chosen).values():
-                env = make_env(config, made, group[0], min(config.flags.worlds, len(group)))
-                try:
-                    results: list[EpisodeResult] = []
-                    Rollout(env, policy, group, max_steps=group[0].max_steps, on_finish=results.append).run()
-                finally:
-                    env.close()
-                for result in results:
-                    episode: Episode = result.episode
-                    _compare(
-                        audit, wanted[episode.task, tracker, episode.mode, episode.group_seed, episode.repeat], result
-                    )
+            if policy is not None:
+                other = resolve(RunOptions(**rollout_flags(stored, tracker, policy, Chunks)))  # type: ignore[arg-type]
+                other, again = check_parts(dataclasses.replace(other, episodes=tuple(chosen)), made)
+                _note_differences(audit, other, ("policy", "policy_file", "policy_facts", "labels"))
+            for (task, _, mode), group in groups(chosen).items():
+                cameras = stored_cameras(audit, f"{task} {tracker} {mode}") if again is None else other.cameras
+                config = dataclasses.replace(config, cameras=cameras)
+                lines = {e.index: wanted[e.task, tracker, e.mode, e.group_seed, e.repeat] for e in group}
+                recorded = {
+                    i: RecordedQueries.read(run.folder / line.media["actions"])
+                    for i, line in lines.items()
+                    if line.media is not None
+                }
+                seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
+                for result in played(config, made, player, group, [seen]):
+                    index = result.episode.index
+                    _compare(audit, lines[index], result, seen.taken(index)[1])
+                for index, answers in seen.answers.items():
+                    largest = max(largest, answers.largest)
+                    compared, equal = compared + answers.asked, equal + answers.equal
+                    name = f"{run.folder / JOURNAL_FILE}: episode {lines[index].index}"
+                    if answers.error is not None or not recorded[index].queries:
+                        cause = answers.error or "its actions do not say when the policy was asked"
+                        audit.faults.append(f"{name}: the policy cannot be asked again: {cause}")
+                    elif answers.first is not None:
+                        audit.faults.append(
+                            f"{name}: at tick {answers.first} the policy decides otherwise; actions differ by up to "
+                            f"{answers.largest:.3g}"
+                        )
         finally:
-            policy.close()
+            player.close()
+            if again is not None:
+                again.close()
     audit.replayed = len(records)
-    found = 1.0 - (1.0 - FORGED) ** len(records)
-    sure = (
-        "any forged line" if len(records) == len(run.records) else f"one of {FORGED:.0%} forged lines with {found:.0%}"
-    )
+    odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
+    sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
+    if policy is not None:
+        audit.asked = len(records)
+        audit.notes.append(
+            f"The policy was asked again: {equal} of {counted(compared, 'action')} are equal to the bit, the largest "
+            f"difference is {largest:.3g} (--tolerance {tolerance:g})."
+        )
 
 
-def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult) -> None:
+def played(
+    config: RunConfig, made: Factories, policy: Policy, group: Sequence[Episode], recorders: Sequence[Recorder] = ()
+) -> Iterator[EpisodeResult]:
+    """Episodes of one task, tracker and mode, played in an environment of their own, as they end."""
+    env = make_env(config, made, group[0], min(config.flags.worlds, len(group)))
+    try:
+        results: list[EpisodeResult] = []
+        latency = config.flags.latency_ticks
+        Rollout(
+            env,
+            policy,
+            group,
+            recorder=recorders,
+            max_steps=group[0].max_steps,
+            latency=latency,
+            on_finish=results.append,
+        ).run()
+    finally:
+        env.close()
+    yield from results
+
+
+def stored_cameras(audit: Audit, group: str) -> dict[str, CameraConfig]:
+    """Cameras of the policy of a run, by name, as the environment of a group kept them; none for one that did not see.
+
+    Raises:
+        InputError: One is unfit.
+    """
+    where = f"{audit.run.folder / CONFIG_FILE}: environments: {group}: {CAMERAS}"
+    stored = audit.run.document.get("environments", {}).get(group, {}).get(CAMERAS, {})
+    cameras = {}
+    for name, facts in stored.items() if isinstance(stored, dict) else ():
+        one = cameras[name] = loaded(where, facts if isinstance(facts, dict) else {}, CameraConfig)
+        if max(one.width, one.height) > SIZE_LIMITS[1] or not 1 <= one.samples <= MOST_SAMPLES:
+            raise InputError(f"{where}: {shown(facts)}: is larger than a camera of a policy")
+    return cameras
+
+
+def _note_differences(audit: Audit, config: RunConfig, keys: Sequence[str]) -> None:
+    """Say where what is installed or asked here is not what the run names."""
+    here, there = config.identity(), audit.run.config
+    for key in keys:
+        found = differing_key({key: there.get(key)}, {key: here.get(key)})
+        note = f"Replayed with another {key} than the run's: what differs may come of that."
+        if found is not None and note not in audit.notes:
+            audit.notes.append(note)
+
+
+def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str]) -> None:
     """Hold an episode that was played again to its line."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
+    again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)
         if was != (tuple(value) if isinstance(was, tuple) else value):

@@ -34,6 +34,7 @@ class FakeEnv:
 
     startup_ticks = 0
     scene = None
+    cameras = {}
     physics = SimpleNamespace(qpos=torch.zeros(1, 7).expand(4096, 7), qvel=torch.zeros(1, 6).expand(4096, 6))
     torch_device = torch.device("cpu")
 
