@@ -261,7 +261,7 @@ def forge(folder: Path, change: Forgery, *, tables: bool = True) -> None:
 def level_of(
     folder: Path, published: str, *, policy: str | None = None, factories: Factories | None = None
 ) -> tuple[str, list[str]]:
-    """What of an audit finds a forgery first, and its contradictions: lines, replay, policy; else head, or nothing.
+    """Part of an audit that finds a forgery first, and contradictions: lines, replay, policy; else head, or nothing.
 
     A published head finds all that changes an episode; it is asked last, for folders of which none was published.
 

@@ -25,7 +25,7 @@ from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_p
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.eval.reports.progress import kernels_to_compile
-from arena_newton.eval.workers.messages import Broke, Built, Ended, EpisodeBatch, EpisodeFile, Event, Ticks, broke
+from arena_newton.eval.workers.messages import ActionFile, Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.policies.base import Policy
 
@@ -142,7 +142,7 @@ class _BatchFolder(ResultsFolder):
 
     def keep_file(self, name: str, content: bytes) -> None:
         """Send a file of an episode."""
-        self._send(EpisodeFile(name, content))
+        self._send(ActionFile(name, content))
 
     def keep_trace(self) -> None:
         """Keep the error, to be sent."""

@@ -12,7 +12,7 @@ from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Broke", "Built", "Done", "Ended", "EpisodeBatch", "EpisodeFile", "Event", "Node", "Opened", "Ticks"]
+__all__ = ["Broke", "Built", "Done", "Ended", "EpisodeBatch", "ActionFile", "Event", "Node", "Opened", "Ticks"]
 __all__ += ["broke"]
 
 
@@ -71,8 +71,8 @@ class Ticks:
 
 
 @dataclass(frozen=True)
-class EpisodeFile:
-    """A file of an episode whose line follows, for the results folder."""
+class ActionFile:
+    """File of the actions of an episode whose line follows, for the results folder."""
 
     name: str
     """Path below the folder."""
@@ -102,7 +102,7 @@ class Broke:
     trace: str
 
 
-Event = Built | Ticks | EpisodeFile | Ended | Broke
+Event = Built | Ticks | ActionFile | Ended | Broke
 
 
 def broke(error: BaseException) -> Broke:
