@@ -158,9 +158,9 @@ def cells(text: str) -> str:
 
 
 def rates(text: str) -> str:
-    """table.csv with a rate of 1."""
+    """table.csv with another rate."""
     rows = list(csv.reader(io.StringIO(text)))
-    rows[1][rows[0].index("sr")] = "1.0"
+    rows[1][rows[0].index("sr")] = "0.123"
     return "\n".join(",".join(row) for row in rows) + "\n"
 
 
@@ -305,8 +305,7 @@ def under_the_name_of(honest: Path, folder: Path) -> None:
     """Give the episodes of another policy the name of an honest run's policy, everywhere."""
     ours, lines = document(honest), journal_lines(folder)
     of_honest = journal_lines(honest)[0]
-    document(folder, config=ours["config"], config_hash=ours["config_hash"], environments=ours["environments"])
-    document(folder, options__policy=ours["options"]["policy"])
+    document(folder, config=ours["config"], config_hash=ours["config_hash"], options__policy=ours["options"]["policy"])
     for line in lines:
         line.pop("privileged", None)
         line |= {key: of_honest[key] for key in ("policy", "privileged") if key in of_honest}

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.asked_again import AskedAgain, RecordedQueries
 from arena_newton.eval.audit.folder_audit import Audit
+from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
@@ -36,6 +37,10 @@ COMPARED = "outcome reason steps margin startup_fall overflow predicates progres
 EVIDENCE = ("final_state", "shown")
 """Hashes of a line that it must give again, where the line has them."""
 ENGINE = "mujoco"
+DECIDED = ("outcome", "reason")
+"""Keys of a line that episodes of another engine must give when each tick is checked from its recorded state."""
+LATE = 2
+"""Ticks by which such an episode may end earlier or later: a force or margin near its bar."""
 FORGED = (0.01, 0.05, 0.1, 0.25)
 """Fractions of forged lines for which an audit says how probably the drawn episodes find one."""
 MOST_SAMPLES = 4
@@ -69,7 +74,7 @@ def rollout_flags(stored: RunOptions, tracker: str, policy: str, *kinds: type) -
     groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
     names = (*groups_of, *more, "task", "seeds", "repeats", "checkpoint")
     same = {name: getattr(stored, name) for name in names}
-    return same | {"policy": policy, "tracker": (tracker,), "engine": ENGINE, "actions": False}
+    return same | {"policy": policy, "tracker": (tracker,), "engine": ENGINE, "device": "cpu", "actions": False}
 
 
 def replay(
@@ -79,6 +84,7 @@ def replay(
     *,
     policy: str | None = None,
     tolerance: float = 0.0,
+    tick_tolerance: float = 0.01,
 ) -> None:
     """Play episodes again, and add what differs to the audit's contradictions.
 
@@ -88,18 +94,22 @@ def replay(
         factories: What worlds, trackers and policies are made with; the real ones by default.
         policy: Spec of a policy to ask again at the recorded queries.
         tolerance: Largest difference of an action that is still the policy's.
+        tick_tolerance: Largest difference of a position after a tick of another engine [m or rad].
 
     Raises:
-        InputError: They were not played on engine mujoco, are demonstrations, or cannot be played here.
+        InputError: They were played on another engine and no states were recorded, are demonstrations, or cannot be
+            played here.
     """
     run, made = audit.run, factories or Factories()
     stored, where = stored_options(run.folder), f"--replay: {run.folder}"
-    if run.config.get("engine") != ENGINE:
-        raise InputError(f"{where} was played on engine {shown(run.config.get('engine'))}; {ENGINE} alone repeats bits")
+    by_tick = run.config.get("engine") != ENGINE
+    if by_tick and not all(EPISODE in (record.media or {}) for record in records):
+        engine = f"was played on engine {shown(run.config.get('engine'))}, and {ENGINE} alone repeats bits"
+        raise InputError(f"{where} {engine}; ticks are checked one by one where states were recorded (--record)")
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
     wanted = {(r.task, r.tracker, r.mode, r.group_seed, r.repeat): r for r in records}
-    largest, compared, equal = 0.0, 0, 0
+    largest, furthest, compared, equal = 0.0, 0.0, 0, 0
     for tracker in dict.fromkeys(record.tracker for record in records):
         actions = run.folder / actions_folder(stored.tracker, tracker)
         config = resolve(RunOptions(**rollout_flags(stored, tracker, f"replay:{actions}")))  # type: ignore[arg-type]
@@ -122,9 +132,14 @@ def replay(
                     if line.media is not None
                 }
                 seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
-                for result in played(config, made, player, group, [seen]):
+                states = StatesAgain({i: run.folder / (one.media or {}).get(EPISODE, "") for i, one in lines.items()})
+                for result in played(config, made, player, group, [states, seen] if by_tick else [seen]):
                     index = result.episode.index
-                    _compare(audit, lines[index], result, seen.taken(index)[1])
+                    if by_tick:
+                        _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
+                        furthest = max(furthest, *states.differences[index].ticks)
+                    else:
+                        _compare(audit, lines[index], result, seen.taken(index)[1])
                 for index, answers in seen.answers.items():
                     largest = max(largest, answers.largest)
                     compared, equal = compared + answers.asked, equal + answers.equal
@@ -145,6 +160,11 @@ def replay(
     odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
     sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
+    if by_tick:
+        audit.notes.append(
+            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. The state "
+            f"after it differs by at most {furthest:.2g} m or rad (--tick-tolerance {tick_tolerance:g}), no bit counts."
+        )
     if policy is not None:
         audit.asked = len(records)
         audit.notes.append(
@@ -211,6 +231,23 @@ def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidenc
         if was != (tuple(value) if isinstance(was, tuple) else value):
             where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
             audit.faults.append(f"{where}: {name} is {_short(was)}, its actions give {_short(value)}")
+
+
+def _compare_ticks(
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, differences: TickDifferences, tolerance: float
+) -> None:
+    """Hold an episode of another engine, whose ticks were checked one by one, to its line and recorded states."""
+    where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
+    for name in DECIDED:
+        if (was := getattr(record, name)) != (now := getattr(result, name)):
+            audit.faults.append(f"{where}: {name} is {shown(was)}, its recorded states give {shown(now)}")
+    if abs(record.steps - result.steps) > LATE:
+        audit.faults.append(f"{where}: ended after {record.steps} steps, its recorded states end after {result.steps}")
+    if differences.start > START:
+        audit.faults.append(f"{where}: its first state is {differences.start:.2g} m or rad from that of its seed")
+    if (worst := max(differences.ticks, default=0.0)) > tolerance:
+        tick = differences.ticks.index(worst)
+        audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m or rad from what {ENGINE} gives")
 
 
 def _short(value: object) -> str:

@@ -36,6 +36,9 @@ class AuditOptions:
     tolerance: float = 0.0
     """Largest difference of an action that is still the policy's: 0 compares bits; 1e-4 fits a network that answered on
     another processor."""
+    tick_tolerance: float = 0.01
+    """Largest difference of a position after a tick [m or rad], where a run of engine warp kept its states (--record)
+    and each tick is checked on engine mujoco."""
     fresh: int = 0
     """Play so many new episodes of --policy for each task, tracker and mode, on a group seed drawn by --draw; an exact
     test compares their rate with the claimed one."""
@@ -75,8 +78,9 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         if options.replay or options.all:
             from arena_newton.eval.audit.action_replay import drawn, replay
 
+            asked = {name: getattr(options, name) for name in ("policy", "tolerance", "tick_tolerance")}
             chosen = drawn(one, None if options.all else options.replay, options.draw)
-            replay(one, chosen, factories, policy=options.policy, tolerance=options.tolerance)
+            replay(one, chosen, factories, **asked)
         if options.fresh and options.policy is not None:
             from arena_newton.eval.audit.fresh_episodes import play_fresh
 

@@ -1,18 +1,23 @@
 """Audits accuse no honest folder, and find forgeries at the level at which they can be found."""
 
+import dataclasses
 import json
 import shutil
 
 import numpy as np
 import pytest
+import torch
 from eval_fakes import FakeEnv, FakePolicy, factories
 
+from arena_newton import policies
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.chain import head
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.interfaces import Chunk
 from arena_newton.kernels import tick as codes
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from benchmarks.forgeries import FORGERIES, TABLES, forge, journal_lines, level_of, write_lines
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "5"]
@@ -171,3 +176,60 @@ def test_a_broken_link_is_named(folder, capsys, change, number):
     write_lines(folder, lines, link=False)
     code, found = audit(folder, capsys)
     assert code == 1 and any(f"line {number} is not linked to line {number - 1}: " in line for line in found), found
+
+
+class Seeing(FakePolicy):
+    """A policy that stands, sees a small picture, and moves its first joint by how bright that is."""
+
+    needs_image = True
+    camera = CameraConfig(width=32, height=24, fit="native")
+    chunk_size = 4
+
+    def act(self, observation):
+        actions = torch.tensor(STAND_ACTION).repeat(len(observation.mask), self.chunk_size, 1)
+        actions[:, :, ACTION["joint_pos"].start] += observation.image.float().mean(dim=(1, 2, 3))[:, None] / 2550
+        return Chunk(actions)
+
+
+def test_pictures_are_drawn_again(parts, tmp_path, capsys):
+    """A replay draws with its stored camera what the policy was shown; a policy that was shown more is found."""
+    made = dataclasses.replace(
+        parts, policy=lambda spec, **options: (policies.get if spec.startswith("replay") else Seeing)(spec, **options)
+    )
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "mujoco", "--repeats", "2", "--seeds", "0"]
+    assert main([*flags, "--out", str(tmp_path / "run")], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all", "--policy", "stand"], made) == 0
+    assert "level re-run" in capsys.readouterr().out
+    forge(tmp_path / "run", lambda folder, lines: shown_otherwise(folder))
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 1
+    assert capsys.readouterr().out.count("shown is") == 2
+
+
+def shown_otherwise(folder):
+    """The policy is said to have had another camera."""
+    content = json.loads((folder / "config.json").read_text())
+    content["environments"]["football twist2 base"]["cameras"]["front"]["width"] = 28
+    (folder / "config.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
+    """States that engine warp recorded follow from each other on engine mujoco; a step aside between two is found."""
+    run, bare = tmp_path / "run", tmp_path / "bare"
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "warp", "--device", "cpu", "--seeds", "0"]
+    flags += ["--repeats", "2", "--worlds", "2"]
+    assert main([*flags, "--out", str(bare)], parts) == 0
+    assert main([*flags, "--record", "--record-cameras", "--out", str(run)], parts) == 0
+    assert main(["audit", str(bare), "--all"], parts) == 2
+    assert "ticks are checked one by one where states were recorded (--record)" in capsys.readouterr().err
+    assert main(["audit", str(run), "--all"], parts) == 0
+    said = capsys.readouterr().out
+    assert "level replayed" in said and "each tick was checked on mujoco" in said
+    path = next((run / "episodes").glob("*repeat0000.npz"))
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["arena_qpos"][7:, 0] += 0.05
+    np.savez_compressed(path, **arrays)
+    assert main(["audit", str(run), "--all"], parts) == 1
+    (found,) = (line for line in capsys.readouterr().out.splitlines() if "contradiction: " in line)
+    assert "the state after tick 6 is 0.05 m or rad from what mujoco gives" in found
