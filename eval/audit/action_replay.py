@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.asked_again import AskedAgain, RecordedQueries
 from arena_newton.eval.audit.folder_audit import Audit
-from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain, TickDifferences
+from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
@@ -84,7 +84,7 @@ def replay(
     *,
     policy: str | None = None,
     tolerance: float = 0.0,
-    tick_tolerance: float = 0.01,
+    tick_tolerance: float = 0.005,
 ) -> None:
     """Play episodes again, and add what differs to the audit's contradictions.
 
@@ -94,7 +94,7 @@ def replay(
         factories: What worlds, trackers and policies are made with; the real ones by default.
         policy: Spec of a policy to ask again at the recorded queries.
         tolerance: Largest difference of an action that is still the policy's.
-        tick_tolerance: Largest difference of a position after a tick of another engine [m or rad].
+        tick_tolerance: Largest distance of a body after a tick of another engine [m].
 
     Raises:
         InputError: They were played on another engine and no states were recorded, are demonstrations, or cannot be
@@ -137,7 +137,7 @@ def replay(
                     index = result.episode.index
                     if by_tick:
                         _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
-                        furthest = max(furthest, *states.differences[index].ticks)
+                        furthest = max(furthest, *states.differences[index][1:])
                     else:
                         _compare(audit, lines[index], result, seen.taken(index)[1])
                 for index, answers in seen.answers.items():
@@ -163,7 +163,7 @@ def replay(
     if by_tick:
         audit.notes.append(
             f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. The state "
-            f"after it differs by at most {furthest:.2g} m or rad (--tick-tolerance {tick_tolerance:g}), no bit counts."
+            f"after it has bodies {furthest:.2g} m off at most (--tick-tolerance {tick_tolerance:g}), no bit counts."
         )
     if policy is not None:
         audit.asked = len(records)
@@ -234,7 +234,7 @@ def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidenc
 
 
 def _compare_ticks(
-    audit: Audit, record: EpisodeRecord, result: EpisodeResult, differences: TickDifferences, tolerance: float
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, differences: Sequence[float], tolerance: float
 ) -> None:
     """Hold an episode of another engine, whose ticks were checked one by one, to its line and recorded states."""
     where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
@@ -243,11 +243,12 @@ def _compare_ticks(
             audit.faults.append(f"{where}: {name} is {shown(was)}, its recorded states give {shown(now)}")
     if abs(record.steps - result.steps) > LATE:
         audit.faults.append(f"{where}: ended after {record.steps} steps, its recorded states end after {result.steps}")
-    if differences.start > START:
-        audit.faults.append(f"{where}: its first state is {differences.start:.2g} m or rad from that of its seed")
-    if (worst := max(differences.ticks, default=0.0)) > tolerance:
-        tick = differences.ticks.index(worst)
-        audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m or rad from what {ENGINE} gives")
+    first, after = differences[0], differences[1:]
+    if first > START:
+        audit.faults.append(f"{where}: its first state is {first:.2g} m from that of its seed")
+    if (worst := max(after, default=0.0)) > tolerance:
+        tick = after.index(worst)
+        audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m from what {ENGINE} gives")
 
 
 def _short(value: object) -> str:

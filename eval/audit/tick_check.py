@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +11,15 @@ import torch
 
 from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.interfaces import Observation, Recorder, World
+from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 
-__all__ = ["EPISODE", "START", "StatesAgain", "TickDifferences"]
+__all__ = ["EPISODE", "START", "StatesAgain"]
 
 EPISODE = "episode"
 """Name of the recording of an episode among its media."""
-START = 0.05
-"""Largest difference of the first recorded state from that of the seed, after the start-up [m or rad]."""
-
-
-@dataclass
-class TickDifferences:
-    """Differences of recorded positions from those that engine mujoco gives [m or rad]."""
-
-    start: float = 0.0
-    """At step 0, after the start-up."""
-    ticks: list[float] = field(default_factory=list)
-    """Largest after each tick, from the recorded state before it."""
+START = 0.01
+"""Largest distance of a body in the first recorded state from where the seed puts it, after the start-up [m]."""
 
 
 @dataclass
@@ -49,8 +39,9 @@ class StatesAgain(Recorder):
     def __init__(self, files: Mapping[int, Path]):
         """Take the recordings of `eval run --record` by the episode's number."""
         self.files = files
-        self.differences: dict[int, TickDifferences] = {}
-        """By the episode's number."""
+        self.differences: dict[int, list[float]] = {}
+        """Largest distance along an axis of a body from its recorded position, before each tick and at the end [m], by
+        the episode's number; the first is after the start-up from the seed, the others after one tick each."""
         self._states: dict[int, _Recorded] = {}
 
     def start(self, env: World, world: int, episode: Episode) -> None:
@@ -63,24 +54,24 @@ class StatesAgain(Recorder):
         positions, last = file.array("arena_qpos", -1, model.nq), file.array("arena_final_qpos", model.nq)
         velocities = file.array("arena_qvel", len(positions), model.nv)
         self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities)
-        self.differences[episode.index] = TickDifferences()
+        self.differences[episode.index] = []
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
-        """Take up the recorded state."""
-        qpos = env.physics.qpos.numpy()
+        """Measure how far off the recorded state is, and take it up."""
         for world in np.flatnonzero(env.active & (env.tick >= 0)).tolist():
-            mine, tick = self._states[world], int(env.tick[world])
-            if tick >= len(mine.velocities):
-                continue
-            if tick == 0:
-                self.differences[mine.index].start = float(np.abs(qpos[world] - mine.positions[0]).max())
-            assert isinstance(env.physics, MujocoPhysics), "the audit plays on engine mujoco"
-            env.physics.put(world, mine.positions[tick], mine.velocities[tick])
+            self._take_up(env, world, int(env.tick[world]))
 
-    def tick(self, env: World) -> None:
-        """Measure the state after the tick."""
-        qpos = env.physics.qpos.numpy()
-        for world in np.flatnonzero(env.active & (env.tick > 0)).tolist():
-            mine, tick = self._states[world], int(env.tick[world])
-            if tick < len(mine.positions):
-                self.differences[mine.index].ticks.append(float(np.abs(qpos[world] - mine.positions[tick]).max()))
+    def finish(self, env: World, world: int, result: EpisodeResult) -> None:
+        """Measure how far off the recorded last state is."""
+        self._take_up(env, world, result.steps)
+        del self._states[world]
+
+    def _take_up(self, env: World, world: int, tick: int) -> None:
+        """Put a world into the recorded state at a tick; one that goes on after its recording stays as it is."""
+        assert isinstance(env.physics, MujocoPhysics), "the audit plays on engine mujoco"
+        mine, places = self._states[world], env.physics.xpos.numpy()[world]
+        if tick >= len(mine.positions):
+            return
+        given = places.copy()
+        env.physics.put(world, mine.positions[tick], mine.velocities[min(tick, len(mine.velocities) - 1)])
+        self.differences[mine.index].append(float(np.abs(places - given).max()))

@@ -36,8 +36,8 @@ class AuditOptions:
     tolerance: float = 0.0
     """Largest difference of an action that is still the policy's: 0 compares bits; 1e-4 fits a network that answered on
     another processor."""
-    tick_tolerance: float = 0.01
-    """Largest difference of a position after a tick [m or rad], where a run of engine warp kept its states (--record)
+    tick_tolerance: float = 0.005
+    """Largest distance of a body after a tick [m], where a run of engine warp kept its states (--record)
     and each tick is checked on engine mujoco."""
     fresh: int = 0
     """Play so many new episodes of --policy for each task, tracker and mode, on a group seed drawn by --draw; an exact
