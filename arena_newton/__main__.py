@@ -95,26 +95,14 @@ def _run(arguments: list[str]) -> int:
     if found:
         command = max(found, key=lambda c: len(c.words))
         rest = arguments[len(command.words.split()) :]
-        return _rules(rest) if command.words == "rules" else importlib.import_module(command.module).main(rest)
+        code: int = importlib.import_module(command.module).main(rest)
+        return code
     wants_help = bool(arguments) and arguments[-1] in ("-h", "--help")
     group = " ".join(arguments[:-1] if wants_help else arguments)
     if group and not any(c.words.startswith(f"{group} ") for c in COMMANDS):
         raise InputError(f"{group}: no such command; {PROG} --help lists them")
     print(_overview(group), end="", file=sys.stdout if wants_help else sys.stderr)
     return 0 if wants_help else 2
-
-
-def _rules(arguments: list[str]) -> int:
-    if arguments:
-        text = "takes no arguments; it prints both rule sets as Markdown"
-        if {*arguments} & {"-h", "--help"}:
-            print(f"usage: {PROG} rules\n\nrules {text}.")
-            return 0
-        raise InputError(f"rules {arguments[0]}: {text}")
-    from arena_newton import rule_sets
-
-    print(rule_sets.markdown(), end="")
-    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

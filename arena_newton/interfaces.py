@@ -136,7 +136,7 @@ class EpisodeEvent:
     tick: int
     """Ticks since step 0."""
     detail: str = ""
-    """Of a fall its trigger (`tilt`, `tilt_held`, `contact`), of an object its name."""
+    """Trigger of a fall (`tilt`, `tilt_held`, `contact`), name of an object."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Verdict:
     progress: float = 0.0
     """Fraction of the task's predicates that have held, in [0, 1]; 1 after a success."""
     events: tuple[EpisodeEvent, ...] = ()
-    """In the order of their ticks."""
+    """Events in the order of their ticks."""
 
 
 @dataclass
@@ -182,11 +182,11 @@ class EpisodeResult:
     phases: tuple[tuple[str, int], ...] = ()
     """The policy's phases: name and first tick since step 0, each time one begins."""
     predicates: Mapping[str, int | None] = field(default_factory=dict)
-    """As in `Verdict`."""
+    """Predicates as in `Verdict`."""
     progress: float = 0.0
-    """As in `Verdict`."""
+    """Progress as in `Verdict`."""
     events: tuple[EpisodeEvent, ...] = ()
-    """As in `Verdict`."""
+    """Events as in `Verdict`."""
 
 
 class Planned(Protocol):

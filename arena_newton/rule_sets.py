@@ -7,8 +7,11 @@ The numbers that belong to one task are in that task's file, the common ones in 
 import dataclasses
 import functools
 import sys
+from collections.abc import Sequence
 
 from arena_newton import tasks
+from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.flags import parse_flags
 from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 from arena_newton.rules.rule_types import (
@@ -23,7 +26,7 @@ from arena_newton.rules.rule_types import (
     num,
 )
 
-__all__ = ["get", "markdown", "names", "table", "text"]
+__all__ = ["get", "main", "markdown", "names", "table", "text"]
 
 
 def names() -> tuple[str, ...]:
@@ -265,5 +268,24 @@ def markdown() -> str:
     return "\n".join(lines) + "\n"
 
 
+@dataclasses.dataclass(frozen=True)
+class _NoFlags:
+    """Print both rule sets as Markdown."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the page `docs/rules.md`.
+
+    Returns:
+        Exit code: 0, or 2 for an argument, of which there are none.
+    """
+
+    def work() -> None:
+        parse_flags(_NoFlags, list(sys.argv[1:] if argv is None else argv), program("rules", "arena_newton.rule_sets"))
+        print(markdown(), end="")
+
+    return exit_code(work)
+
+
 if __name__ == "__main__":
-    sys.stdout.write(markdown())
+    sys.exit(main())

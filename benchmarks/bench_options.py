@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arena_newton.cli.flags import Several
-from arena_newton.policies.train.policy_options import bounds
+from arena_newton.cli.flags import Device, Several, bounds
 
 __all__ = [
     "CameraBenchOptions",
@@ -96,12 +95,11 @@ class TrainingBenchOptions(PlainBenchOptions):
     """Time of each measurement [s], after the warm-up."""
     batch_size: int = field(default=0, metadata=bounds(0, 65536))
     """Samples of a step; 0: the recipe's."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N or auto."""
+    device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights, as of a training."""
     graph: bool = True
-    """On CUDA: capture batch and step in one CUDA graph."""
+    """Capture batch and step in one CUDA graph, on CUDA."""
     compile: bool = False
     """Compile the network with torch.compile; not for pi05."""
     against_lerobot: bool = False
@@ -121,9 +119,9 @@ class DatasetBenchOptions(PlainBenchOptions):
     recordings: Several[Path] = ()
     """Folders of recorded episodes: they are built and verified once more, and the time is measured."""
     made: int = 0
-    """So many copies of the recordings under other seeds are built, verified and read instead of --dataset."""
+    """Number of copies of the recordings under other seeds that are built, verified and read instead of --dataset."""
     seed: int = 0
-    """Of the order in which pictures are read."""
+    """Seed of the order in which pictures are read."""
 
 
 @dataclass(frozen=True)

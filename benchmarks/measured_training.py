@@ -20,6 +20,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from arena_newton.errors import ArenaError
+from arena_newton.physics.devices import torch_device
 from arena_newton.pictures.settings import FRONT
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe, recipe
 from arena_newton.policies.train.families import families
@@ -35,7 +36,7 @@ from arena_newton.policies.train.frames.frame_store import FrameStore, load_fram
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
-from arena_newton.policies.train.training import chosen_device, fast_kernels, make_batches
+from arena_newton.policies.train.training import fast_kernels, make_batches
 from benchmarks.bench_options import TrainingBenchOptions
 from benchmarks.made_frames import made_frames
 
@@ -152,7 +153,7 @@ def measured(options: TrainingBenchOptions, *, lerobot: bool = False) -> SpeedFi
     Raises:
         ArenaError: The training cannot be made, or its loss is not finite.
     """
-    device, _ = chosen_device(options.device)
+    device = torch_device(options.device)
     cuda = device.type == "cuda"
     if cuda:
         torch.cuda.set_device(device)

@@ -43,9 +43,9 @@ class _Played:
     """Episodes that a command played."""
 
     seconds: float
-    """From the first episode's start to the last one's end [s]."""
+    """Time from the first episode's start to the last one's end [s]."""
     command_seconds: float
-    """From the command's start to its end [s]."""
+    """Time from the command's start to its end [s]."""
     solved: int
     """Episodes that succeeded."""
 

@@ -58,7 +58,7 @@ class Pair:
             label: Name of the figure.
             rounds: Ours and the peer's of each round.
             unjudged: Why the bar is not judged; it is judged where this is empty.
-            notes: More to be said.
+            notes: Further notes.
             device: Device; the GPU, or the processor where there is none, by default.
             peer_versions: Versions of a peer that has an interpreter of its own.
         """

@@ -10,11 +10,12 @@ from collections.abc import Iterator
 
 import torch
 
+from arena_newton.cli.flags import check_bounds
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.own_processes import environment
-from arena_newton.policies.train.policy_options import check_choices, check_ranges
-from arena_newton.policies.train.training import chosen_device
+from arena_newton.physics.devices import torch_device
+from arena_newton.policies.train.policy_options import check_choices
 from benchmarks.bench_options import TrainingBenchOptions
 from benchmarks.measured_training import READY, SpeedFigure, bench_recipe
 
@@ -34,7 +35,7 @@ def check(options: TrainingBenchOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_ranges(options)
+    check_bounds(options)
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if not options.trainings or not all(1 <= n <= MOST_TRAININGS for n in options.trainings):
         raise InputError(f"--trainings: expected numbers from 1 to {MOST_TRAININGS}")
@@ -52,7 +53,7 @@ def training_figures(options: TrainingBenchOptions) -> Iterator[BenchFigure]:
         ArenaError: A training failed, or the trainings do not fit into the device's memory.
     """
     check(options)
-    device, _ = chosen_device(options.device)
+    device = torch_device(options.device)
     settings = bench_recipe(options)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     judged = "H200" in name and settings.family == "act" and settings.batch_size == 64 and settings.name != "small"

@@ -56,7 +56,7 @@ COMMANDS = {
     "protocols": CommandRow("one checkpoint through lerobot-eval and each served protocol, compared"),
     "certify": CommandRow("prove the benchmark: checks, a certificate, an exit code"),
 }
-"""By name, as the overview lists them."""
+"""Commands by name, as the overview lists them."""
 
 
 def main(argv: Sequence[str] | None = None, factories: Factories | None = None) -> int:

@@ -72,7 +72,7 @@ LEAST_CLEARANCE = wp.constant(0.05)
 HIGH_STEP, RISE_PER_HEIGHT, MOST_RISE = wp.constant(0.08), wp.constant(1.6), wp.constant(0.16)
 """A step higher than this [m] rises before it goes on: by this fraction of the swing per metre, up to a limit."""
 LANDING_FIXED, LANDING_BLEND = wp.constant(0.9), wp.constant(0.4)
-"""From this fraction of a swing on, the landing is fixed; in the fraction before, it follows the plan less and less."""
+"""Fraction of a swing from which on the landing is fixed, and that before it in which it follows the plan ever less."""
 GAIT_RATE, GAIT_ACCELERATION = wp.constant(3.0), wp.constant(15.0)
 """Limits of the change between standing and walking [1/s, 1/s²]."""
 MISPLACED = wp.constant(wp.vec2(0.02, 0.07))
@@ -186,7 +186,7 @@ class GaitState:
     final: wp.array[wp.bool]
     """True if it is the last of a walk."""
     gait: wp.array[wp.vec2]
-    """From 0 standing to 1 walking, and its rate [1/s]."""
+    """Gait from 0 standing to 1 walking, and its rate [1/s]."""
     ground: wp.array[float]
     """Commanded height of the ground ahead [m]."""
     floor: wp.array[wp.vec2]

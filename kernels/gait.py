@@ -53,7 +53,7 @@ SEAT_BLEND = wp.constant(0.05)
 COM_AHEAD = wp.constant(0.0214)
 """Centre of mass ahead of the ankles in a relaxed stand [m]: where the default pose has it."""
 CAREFUL_DEPTH = wp.constant(0.2)
-"""In a squat this deep [m] the centre of mass is above the middle of the soles."""
+"""Depth of a squat from which on the centre of mass is above the middle of the soles [m]."""
 KICK_COM_AHEAD = wp.constant(0.055)
 """Centre of mass ahead of the ankle of the standing foot in a kick [m]."""
 KICK_HEIGHT = wp.constant(0.75)

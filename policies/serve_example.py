@@ -3,9 +3,9 @@
 python -m arena_newton.policies.serve_example 8443
 """
 
+import argparse
 import base64
 import json
-import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
@@ -48,4 +48,6 @@ class Server(ThreadingHTTPServer):
 
 
 if __name__ == "__main__":
-    Server(("127.0.0.1", int(sys.argv[1])), Handler).serve_forever()
+    parser = argparse.ArgumentParser(description="Answer queries of a policy at this TCP port.")
+    parser.add_argument("port", type=int)
+    Server(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()

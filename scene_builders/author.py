@@ -10,6 +10,8 @@ from typing import TypedDict, Unpack
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
+from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
+
 Vec = Sequence[float] | np.ndarray
 """A vector or quaternion, of Python or NumPy numbers."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -328,6 +330,6 @@ def camera(
 def dome_light(stage: Usd.Stage) -> Usd.Prim:
     """The uniform dome of every scene."""
     light = UsdLux.DomeLight.Define(stage, "/World/Light")
-    light.CreateIntensityAttr(3000.0)
-    light.CreateColorAttr(Gf.Vec3f(0.75, 0.75, 0.75))
+    light.CreateIntensityAttr(DOME_INTENSITY)
+    light.CreateColorAttr(Gf.Vec3f(*DOME_COLOR))
     return light.GetPrim()

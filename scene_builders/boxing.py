@@ -19,7 +19,7 @@ HOOK_Z = 1.53
 POST_BEHIND = 0.5
 BAGS = {"Bag_1": (-0.97, -3.7), "Bag_2": (-3.0, -3.7)}
 TARGET_POSITION = (-0.97, -3.55, 0.8)
-"""Before the first draw: on the robot's side of bag 1."""
+"""Position before the first draw: on the robot's side of bag 1."""
 TARGET_RADIUS = 0.05
 SEMANTIC_EDGE = 2 * TARGET_RADIUS
 """Edge of the cube that stands in for the sphere [m]: the paper's "green cube of equal bounding extent"."""

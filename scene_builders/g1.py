@@ -286,7 +286,7 @@ def _frames(stage: Usd.Stage) -> None:
 
 
 def _from_ros(quat: Sequence[float]) -> np.ndarray:
-    """From a camera looking along +z with y down to one looking along -z with y up."""
+    """Rotation of a camera that looks along -z with y up, from that of one that looks along +z with y down."""
     return _multiply(_unit(quat), np.array([0.0, 1.0, 0.0, 0.0]))
 
 
@@ -307,5 +307,5 @@ def _z_to(direction: np.ndarray) -> np.ndarray:
 
 
 def _round(values: np.ndarray) -> np.ndarray:
-    """To a hundredth of a millimetre, so that the text of the layer stays short [m]."""
+    """Round to a hundredth of a millimetre, so that the text of the layer stays short [m]."""
     return np.round(np.asarray(values, dtype=float), 5) + 0.0

@@ -81,7 +81,7 @@ class Child:
         return self.printed()
 
     def lines(self, count):
-        """So many lines, or all that it printed before it ended."""
+        """First lines, as many as wanted, or all that it printed before it ended."""
         while self.returncode is None and self.printed()[0].count("\n") < count:
             time.sleep(0.02)
         return self.printed()[0].splitlines()

@@ -38,13 +38,15 @@ INNER = {
     PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets
         | pictures | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
-    f"{PACKAGE}.policies": """recipes | base | label_reader open_loop stand serve_example | protocols | replay_dataset
-        | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
+    f"{PACKAGE}.policies": """chunk_flags recipes | base | label_reader open_loop stand serve_example | protocols
+        | replay_dataset | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
     f"{PACKAGE}.policies.train": """frames network_memory policy_options teachable_network training_log
         | checkpoint_packing families stored_flags teachable | network_compiler | policy_trainer | training_state
         | training_loop | training | training_check __main__""",
     f"{PACKAGE}.trackers": """interface motions | base | inference | front_end
         | evaluation pd sonic tracker_check train twist2 | evaluate __main__""",
+    f"{PACKAGE}.trackers.train": """checkpoint curves model references train_options | export logger sampling simulation
+        | terms | graphs tally | ppo tracker_env | runner | session | __main__""",
 }
 """Folder → its rooms and single modules from the bottom to the top: each imports from those before it. Imports for type
 checkers count here."""
@@ -52,6 +54,7 @@ NAMES_ABOVE = {
     f"{PACKAGE}.interfaces": "protocols name the types that they connect",
     f"{PACKAGE}.trackers.interface": "an interface names the front end and the network that it stands for",
     f"{PACKAGE}.tasks": "a judge is handed the scene and the physics that it reads",
+    f"{PACKAGE}.trackers.train.terms": "a term is handed the worlds of the training that it reads",
 }
 """Rooms whose imports for type checkers may name what stands above them, and why."""
 FRONT_DOOR = f"{PACKAGE}.__main__"

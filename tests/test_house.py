@@ -192,12 +192,12 @@ def test_the_page_of_rooms_names_each():
         assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), f"{file}: no {name}"
 
 
-QUESTION = re.compile(r"(What|Who|Whose|Whether|Where|When|Which|How)\b")
+QUESTION = re.compile(r"(What|Who|Whose|Whom|Why|Whether|Where|When|Which|How|Of|By|As|So|Such|From|In|To)\b")
 """Words with which no docstring begins: it begins with a noun of the field or a verb."""
 
 
 def test_docstrings_name_what_they_describe():
-    """No docstring of the product begins like a question: `True if …`, not `Whether …`."""
+    """No docstring of the product begins like a question or amid a phrase: `True if …`, `Number of …`."""
     found = collections.defaultdict(list)
     for module in known().values():
         for node in module.nodes:

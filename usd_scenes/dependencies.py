@@ -362,7 +362,7 @@ def _locate(asset: str, at: Location, kinds: tuple[str, ...]) -> Location | str:
 
 
 def _file_fault(path: Path) -> str | None:
-    """Why USD must not open a path; symbolic links are followed, nothing is opened."""
+    """Reason for which USD must not open a path; symbolic links are followed, nothing is opened."""
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):

@@ -41,7 +41,7 @@ REFUSALS = {
     errno.EROFS: "cannot be written, the file system is read-only",
     **dict.fromkeys((errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR), ""),
 }
-"""Errors of the operating system that are no fault of the program, with what is said; empty: its own words."""
+"""Errors of the operating system that are not the program's fault, with their message; empty: the system's own."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""

@@ -7,8 +7,9 @@ import dataclasses
 import difflib
 import io
 import itertools
+import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -20,8 +21,13 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 __all__ = [
+    "Device",
+    "Engine",
     "Several",
+    "bounds",
+    "check_bounds",
     "check_least",
+    "check_number",
     "shell_command",
     "flag_name",
     "folders_named",
@@ -37,6 +43,17 @@ Several = Annotated[
     tuple[_T, ...], tyro.conf.arg(help_behavior_hint=lambda shown: f"(default: {shown})" if shown else "")
 ]
 """Values of a flag that takes at least one; help shows no default where it is none of them."""
+Device = Annotated[
+    _T,
+    tyro.conf.arg(
+        help="Device of simulation and networks: cpu, cuda, cuda:1.",
+        help_behavior_hint=lambda shown: f"(default: {'the best there is' if shown in ('None', 'auto') else shown})",
+    ),
+]
+"""Device of a command; None and `auto`: the best there is."""
+Engine = Annotated[
+    str, tyro.conf.arg(help="Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA).")
+]
 
 
 def flag_name(field: str) -> str:
@@ -81,6 +98,35 @@ def check_least(options: DataclassInstance, least: int, *names: str) -> None:
             raise InputError(f"{flag_name(name)} {value}: expected at least {least}")
 
 
+def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
+    """Metadata of a flag whose number, or each of whose numbers by name, is finite and within these bounds."""
+    return {"bounds": (low, high)}
+
+
+def check_bounds(options: DataclassInstance) -> None:
+    """Refuse numbers outside the bounds of their fields.
+
+    Raises:
+        InputError: One is; None is not.
+    """
+    for one in dataclasses.fields(options):
+        given = getattr(options, one.name)
+        for name, number in given.items() if isinstance(given, Mapping) else [("", given)]:
+            if "bounds" in one.metadata and number is not None:
+                check_number(f"{flag_name(one.name)} {name}".rstrip(), number, *one.metadata["bounds"])
+
+
+def check_number(flag: str, value: float, low: float, high: float = math.inf) -> None:
+    """Refuse a number outside its bounds.
+
+    Raises:
+        InputError: It is, or is not finite.
+    """
+    if not (low <= value <= high and math.isfinite(value)):
+        until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
+        raise InputError(f"{flag} {value}: expected a number {until}")
+
+
 def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | None = None) -> T:
     """Parse flags with tyro; a complaint becomes one line of our own.
 
@@ -100,7 +146,7 @@ def parse_flags[T](kind: type[T], arguments: list[str], prog: str, default: T | 
             raise InputError(f"{flag}: cannot read it without a value")
     missing = tyro.MISSING_NONPROP if default is None else default
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there is said again in one line
+        with contextlib.redirect_stderr(io.StringIO()):  # what it draws there becomes one line
             return tyro.cli(kind, args=arguments, prog=prog, default=missing)
     except SystemExit as stop:
         if stop.code in (0, None):

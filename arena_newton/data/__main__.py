@@ -66,7 +66,7 @@ COMMANDS = {
         work="checks.inspection:inspect",
     ),
 }
-"""By name, in the order of a dataset's life."""
+"""Commands by name, in the order of a dataset's life."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

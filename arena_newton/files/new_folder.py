@@ -1,4 +1,4 @@
-"""A folder of results that appears under its name only when it is complete."""
+"""Files and folders held against other processes; a folder of results that appears only when it is complete."""
 
 from __future__ import annotations
 
@@ -12,10 +12,43 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.files.own_files import PARTIAL
 
-__all__ = ["held_folder", "link", "new_folder", "scratch_folder"]
+__all__ = ["held", "held_folder", "link", "new_folder", "scratch_folder"]
 
 LOCK = f"{PARTIAL}.lock"
 """Ending of the file that is locked while the folder grows."""
+
+
+@contextlib.contextmanager
+def held(path: Path, taken: str = "", *, shared: bool = False, wait: bool = False) -> Iterator[int]:
+    """A folder, or a file that is made where there is none, kept from other processes while the block lasts.
+
+    Args:
+        path: The file or folder; a link to a file is not followed, and a folder on a disk without locks is not kept.
+        taken: Message where another process holds it.
+        shared: Others may hold it too that say so.
+        wait: Wait for the other process.
+
+    Yields:
+        The open file.
+
+    Raises:
+        InputError: Another process holds it.
+        OSError: It cannot be opened, or the disk of the file has no locks.
+    """
+    folder = path.is_dir()
+    how = os.O_RDONLY | os.O_DIRECTORY if folder else os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+    file = os.open(path, how, 0o644)
+    try:
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            raise InputError(taken) from None
+        except OSError:  # some network disks have no locks
+            if not folder:
+                raise
+        yield file
+    finally:
+        os.close(file)
 
 
 @contextlib.contextmanager
@@ -50,11 +83,7 @@ def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
         out.parent.mkdir(parents=True, exist_ok=True)
         if part.is_symlink() or part.exists() and not lock.exists():
             raise InputError(f"{flag} {out}: {part} is in the way, and it is not what a killed command left")
-        with os.fdopen(os.open(lock, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o644), "w") as held:
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"{flag} {out}: another process is writing it") from None
+        with held(lock, f"{flag} {out}: another process is writing it"):
             if part.exists():
                 shutil.rmtree(part)
             part.mkdir()
@@ -79,20 +108,13 @@ def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[None]:
     Raises:
         InputError: Another process holds it, or it cannot be made.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise InputError(f"{flag} {out}: cannot be made ({error.strerror})") from None
-    try:
-        with contextlib.suppress(OSError):  # some network disks have no locks
-            try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"{flag} {out}: another process {doing}") from None
+    with contextlib.ExitStack() as stack:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(held(out, f"{flag} {out}: another process {doing}"))
+        except OSError as error:
+            raise InputError(f"{flag} {out}: cannot be made ({error.strerror})") from None
         yield
-    finally:
-        os.close(folder)
 
 
 def link(source: Path, target: Path) -> None:

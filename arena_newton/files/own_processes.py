@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["environment", "how_it_ended", "start_module"]
+__all__ = ["end", "environment", "how_it_ended", "start_module"]
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Set to 1 for a process that shares the cores with others: its libraries would start a thread per core."""
@@ -33,30 +33,46 @@ def environment(*, one_thread: bool = False) -> dict[str, str]:
 def start_module(
     module: str,
     *arguments: object,
-    files: Sequence[int],
     variables: Mapping[str, str],
-    pipes: bool = False,
+    files: Sequence[int] = (),
+    output: int = subprocess.DEVNULL,
     errors: int | None = None,
+    apart: bool = True,
 ) -> subprocess.Popen[bytes]:
-    """Start a module as a program that keeps open files; in a session of its own, as Ctrl-C is for whoever started it.
+    """Start a module as a program.
 
-    Its input and output are nothing, or `pipes` without buffers; its errors are written where those of this process
-    are, or to `errors`; its environment are the `variables`.
+    Args:
+        module: Its name.
+        *arguments: Its command line.
+        variables: Its environment.
+        files: Open files that it keeps.
+        output: Where it writes: nowhere, or an open file; `subprocess.PIPE` stands for its input too, without buffers.
+        errors: Where it writes errors, by default where this process does.
+        apart: It is in a session of its own, as Ctrl-C is for whoever started it.
 
     Raises:
         OSError: The system lets no process start.
     """
-    stream, command = subprocess.PIPE if pipes else subprocess.DEVNULL, [sys.executable, "-P", "-m", module]
     return subprocess.Popen(
-        [*command, *map(str, arguments)],
+        [sys.executable, "-P", "-m", module, *map(str, arguments)],
         pass_fds=files,
         env=variables,
-        stdin=stream,
-        stdout=stream,
+        stdin=subprocess.PIPE if output == subprocess.PIPE else subprocess.DEVNULL,
+        stdout=output,
         stderr=errors,
         bufsize=0,
-        start_new_session=True,
+        start_new_session=apart,
     )
+
+
+def end(process: subprocess.Popen[bytes], patience: float, how: int = 0) -> None:
+    """End a process by a signal, or wait for its end (0), and kill it where it lasts longer [s]."""
+    process.send_signal(how)
+    try:
+        process.wait(patience)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def how_it_ended(process: subprocess.Popen[bytes], patience: float) -> str:

@@ -233,7 +233,7 @@ def _expected(hint: object) -> str:
 
 @functools.cache
 def _fields(kind: type) -> dict[str, tuple[Callable[[Json], bool], str]]:
-    """Of each field of a dataclass or a typed dictionary what tests it, and what messages say."""
+    """Fields of a dataclass or a typed dictionary: what tests a value, and its description in messages."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {key: (tester(hint), _expected(hint)) for key, hint in hints.items()}
 
@@ -284,7 +284,7 @@ def _made(kind: type, values: Mapping[str, Json]) -> Json:
 
 @functools.cache
 def _makers(kind: type) -> dict[str, Callable[[Json], object] | None]:
-    """Of each field of a dataclass what makes its value of a stored one; None where both are the same."""
+    """Fields of a dataclass: what makes the value of a stored one; None where both are the same."""
     return {key: _maker(hint) for key, hint in typing.get_type_hints(kind).items()}
 
 

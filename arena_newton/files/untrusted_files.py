@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import math
 import os
 import stat
@@ -98,7 +99,9 @@ def array_digest(arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where: str = "") -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | Path, wanted: Iterable[str] | None = None, *, where: str = "", content: bytes | None = None
+) -> dict[str, np.ndarray]:
     """Read arrays of an NPZ file; no object arrays, and none that is larger than `limits` says.
 
     Args:
@@ -106,6 +109,7 @@ def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where:
         wanted: Names of the arrays to read, where the file has them; all by default. The others are not
             unpacked and are returned as empty arrays.
         where: What errors name; the path by default.
+        content: The file's content, where it was read before; the path is not opened then.
 
     Returns:
         Array by name, in the file's order.
@@ -116,10 +120,13 @@ def read_arrays(path: str | Path, wanted: Iterable[str] | None = None, *, where:
     where = where or str(path)
     chosen = None if wanted is None else set(wanted)
     try:
-        size = os.stat(path).st_size
-        check_size(path, max(size, 1), where=where)
+        if content is None:
+            size = os.stat(path).st_size
+            check_size(path, max(size, 1), where=where)
+        else:
+            size = len(content)
         allowed = max(limits.ARRAY_BYTES, limits.ARRAY_GROWTH * size)
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(path if content is None else io.BytesIO(content)) as archive:
             members = archive.infolist()
             if len(members) > limits.ARCHIVE_MEMBERS:
                 raise InputError(f"{where}: holds {len(members)} members, expected at most {limits.ARCHIVE_MEMBERS}")

@@ -23,7 +23,7 @@ FILES = {"img-src": "'self' file:"}
 @functools.cache
 def _templates(folder: Path) -> jinja2.Environment:
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
+        loader=jinja2.FileSystemLoader([folder, Path(__file__).parent]),
         autoescape=True,
         finalize=lambda value: value if hasattr(value, "__html__") else plain(value),
         undefined=jinja2.StrictUndefined,
@@ -44,7 +44,8 @@ def render(
     """A page as text, the same for the same content byte for byte; it loads its own style and script and nothing else.
 
     Args:
-        template: Shows `content`, and `policy`, `style` and `script`, of which the last two are not escaped.
+        template: Shows `content`, and, by the `frame.html` next to this file, `policy`, `style` and `script`, of which
+            the last two are not escaped.
         styles: Style sheets next to the template.
         script: The page's script next to the template, if it has one.
         sources: Further directives of the policy, such as `FILES`.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from arena_newton.files.text import plain
 
-__all__ = ["Table", "between", "escaped", "latex_text", "percent", "points"]
+__all__ = ["Table", "between", "csv_lines", "escaped", "latex_text", "percent", "points"]
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -66,6 +66,13 @@ def points(value: float) -> str:
     """A difference of fractions in percentage points, such as `−4.2`."""
     text = f"{100 * value:+.1f}"
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
+
+
+def csv_lines(rows: Iterable[Sequence[object]], end: str = "\n") -> str:
+    """Lines of CSV with this end; cells as they are, None empty."""
+    out = io.StringIO(newline="")
+    csv.writer(out, lineterminator=end).writerows(rows)
+    return out.getvalue()
 
 
 @dataclass(frozen=True)
@@ -129,6 +136,4 @@ class Table:
 
     def csv(self) -> str:
         """CSV with a head; cells as they are, None empty."""
-        out = io.StringIO(newline="")
-        csv.writer(out, lineterminator="\n").writerows([self.head, *self.rows])
-        return out.getvalue()
+        return csv_lines([self.head, *self.rows])

@@ -1,14 +1,21 @@
 """Engine and device of a run, chosen while it is planned: Warp is loaded only where a GPU may be."""
 
+from __future__ import annotations
+
 import ctypes
 import itertools
 import os
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
 
-__all__ = ["cluster_engine", "resolve_engine", "visible_gpus"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["cluster_engine", "resolve_engine", "torch_device", "visible_gpus"]
 
 NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
@@ -44,6 +51,27 @@ def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
     if engine == "auto":
         engine = "warp" if cuda else "mujoco"
     return engine, device or ("cuda:0" if cuda else "cpu")
+
+
+def torch_device(name: str | None) -> torch.device:
+    """Torch device for None or `auto`, the best there is, or for a name; each process of torchrun has its own GPU.
+
+    Raises:
+        InputError: This machine does not have it.
+    """
+    import torch
+
+    gpus = torch.cuda.device_count()
+    wanted = ("cuda" if gpus else "cpu") if name in (None, "auto") else name
+    if wanted == "cpu":
+        return torch.device("cpu")
+    found = re.fullmatch(r"cuda(?::(\d+))?", str(wanted))
+    if found is None:
+        raise InputError(f"--device {name}: unknown, choose cpu, cuda or cuda:N")
+    own = os.environ.get("LOCAL_RANK", "0") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else found[1]
+    if int(own or 0) >= gpus:
+        raise InputError(f"--device {name}: no such device, this machine has {gpus} for CUDA")
+    return torch.device("cuda", int(own or 0))
 
 
 def _loads(library: str) -> bool:

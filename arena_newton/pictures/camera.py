@@ -26,14 +26,14 @@ from arena_newton.errors import InputError
 from arena_newton.kernels.pictures.lighting import launch_camera_poses, launch_shade
 from arena_newton.kernels.pictures.raster import launch_rasterize
 from arena_newton.kernels.pictures.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
-from arena_newton.pictures.settings import CameraConfig, Fit
+from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, CameraConfig, Fit
 from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
 if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
     from arena_newton.tasks import LightDraw
 
-__all__ = ["CAMERA_PRIMS", "DOME_INTENSITY", "Buffers", "Camera", "CameraConfig", "WorldLights"]
+__all__ = ["CAMERA_PRIMS", "Buffers", "Camera", "CameraConfig", "WorldLights"]
 
 CAMERA_PRIMS = {
     "ego": "front_cam",
@@ -43,10 +43,6 @@ CAMERA_PRIMS = {
 }
 """Camera name → prim (a path, or a name under the robot)."""
 LIGHT_PRIM = "/World/Light"
-DOME_INTENSITY = 3000.0
-"""Intensity of the original's dome light."""
-DOME_COLOR = (0.75, 0.75, 0.75)
-"""Colour of the original's dome light, linear RGB."""
 SHADOW_BYTES = 2 << 30
 """Memory of a camera's shadow maps; more worlds than fit are drawn in several parts [B]."""
 

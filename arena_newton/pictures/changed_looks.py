@@ -18,7 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-__all__ = ["SEMANTIC_COLOURS", "Changes", "changed_looks", "luminance", "palette", "recoloured", "seen_colours"]
+from arena_newton.kernels.pictures.lighting import FULL_LIGHT
+from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
+
+__all__ = ["SEMANTIC_COLOURS", "Changes", "changed_looks", "hue_lacks", "luminance", "palette", "recoloured"]
+__all__ += ["seen_colours"]
 
 SEMANTIC_COLOURS = (
     (0.05, 0.85, 0.1),  # the cube on the bag
@@ -61,7 +65,7 @@ APART = 0.07
 """Least distance of a drawn colour from each of them as a picture shows it, in RGB from 0 to 1."""
 COLOURS = 4096
 """Colours of the palette."""
-DOME = 3000.0 * 0.75 / 1700.0
+DOME = DOME_INTENSITY * DOME_COLOR[0] / FULL_LIGHT
 """Exposure of the scenes' dome (`kernels.pictures.lighting`)."""
 FACINGS = (0.45, 0.6, 0.725, 0.85, 1.0)
 """Light of the dome on surfaces that face down to up (`BOUNCE` to 1)."""
@@ -102,6 +106,15 @@ def seen_colours(albedo: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).reshape(-1, 3)
 
 
+def hue_lacks(sixths: torch.Tensor, dim: int) -> torch.Tensor:
+    """Fractions of red, green and blue that hues lack, along a new dimension; hues are in sixths of the circle.
+
+    A colour is full within a sixth of the circle to both sides of its own, and zero beyond two.
+    """
+    offsets = torch.stack([torch.remainder(sixths + n, 6.0) for n in (5.0, 3.0, 1.0)], dim=dim)
+    return torch.minimum(offsets, 4.0 - offsets).clamp_(0.0, 1.0)
+
+
 @functools.cache
 def palette(device: torch.device) -> torch.Tensor:
     """All colours that shapes may get, sRGB from 0 to 1, float32, shape [4096, 3]."""
@@ -109,8 +122,8 @@ def palette(device: torch.device) -> torch.Tensor:
     hue, grey, saturation, value = rng.random((4, 4 * COLOURS))
     saturation = np.where(grey < 0.5, 0.25 * saturation, 0.2 + 0.75 * saturation)
     value = 0.06 + 0.88 * value
-    offsets = (hue[:, None] * 6.0 + np.array([5.0, 3.0, 1.0])) % 6.0
-    drawn = value[:, None] * (1.0 - saturation[:, None] * np.clip(np.minimum(offsets, 4.0 - offsets), 0.0, 1.0))
+    lacking = hue_lacks(torch.from_numpy(hue * 6.0), 1).numpy()
+    drawn = value[:, None] * (1.0 - saturation[:, None] * lacking)
     shown = seen_colours(np.array(SEMANTIC_COLOURS).reshape(-1, 3))
     apart = np.linalg.norm(drawn[:, None] - shown[None], axis=2).min(axis=1, initial=1.0) >= APART
     return torch.from_numpy(drawn[apart][:COLOURS].astype(np.float32)).to(device)

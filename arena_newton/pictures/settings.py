@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CAMERAS",
+    "DOME_COLOR",
+    "DOME_INTENSITY",
     "FRONT",
     "MOST_PORT",
     "MOST_VIEWED",
@@ -27,6 +29,10 @@ __all__ = [
     "video_sizes",
 ]
 
+DOME_INTENSITY = 3000.0
+"""Intensity of the original's dome light."""
+DOME_COLOR = (0.75, 0.75, 0.75)
+"""Colour of the original's dome light, linear RGB."""
 Fit = Literal["native", "pad"]
 FRONT = "front"
 """Name of the head camera in datasets, and of its picture among those that a policy observes."""

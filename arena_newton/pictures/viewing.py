@@ -309,7 +309,7 @@ def _quiet_viser(host: str, port: int, record: Path | None = None) -> newton.vie
 
 
 def _quietly[T](call: Callable[[], T]) -> T:
-    """Call without what viewers print whatever they are told."""
+    """Call, and drop what viewers print whatever their settings."""
     with contextlib.redirect_stdout(io.StringIO()):
         return call()
 

@@ -39,13 +39,13 @@ class Condition:
     kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin"]
     """Measured quantity, described in `kernels.rules.predicates`."""
     limit: float = 0.0
-    """In the unit of the kind."""
+    """Limit in the unit of the kind."""
     points: Sequence[BodyFrame] = ()
     boxes: Sequence[Marker] = ()
     horizontal: bool = False
     """Seen from above: heights do not count."""
     address: int = 0
-    """In qpos or qvel, for kinds that read it."""
+    """Address in qpos or qvel, for kinds that read it."""
 
 
 def near(points: Iterable[BodyFrame], box: Marker, limit: float, *, horizontal: bool = False) -> Condition:

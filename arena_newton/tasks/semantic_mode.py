@@ -9,8 +9,8 @@ __all__ = ["semantic_note", "semantic_notes", "task_title"]
 
 CHANGES = {
     "texture": "textures and colours in",
-    "shape": "the shape of a target that is drawn without a collider in",
-    "clutter": "things that are added in",
+    "shape": "the shape of a target without a collider in",
+    "clutter": "added objects in",
 }
 """Change that semantic mode makes → words for it."""
 
@@ -41,7 +41,7 @@ def semantic_note() -> str:
         parts += [f"{words} {', '.join(named)}"] if named else []
     return (
         f"Semantic mode changes looks, and nothing that moves or collides in base mode: {'; '.join(parts)}. (Under "
-        "rules released what counts in VisNavi becomes a disc, too, and Football has a second ball.) How strong these "
-        "shifts are was chosen here (bricks, wood, a blue sofa; the original's files were not at hand): how much a "
-        "policy loses cannot be compared with the paper, only the direction."
+        "rules released the goal zone of VisNavi becomes a disc as well, and Football has a second ball.) The "
+        "strength of these shifts was chosen here (bricks, wood, a blue sofa), because the original's files were not "
+        "available: the direction of a loss can be compared with the paper, its size cannot."
     )

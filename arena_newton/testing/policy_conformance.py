@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from arena_newton import tasks as task_registry
+from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk, Observation, Policy, World
 from arena_newton.pictures.settings import CameraConfig, policy_cameras
-from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH, validate_action
+from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE_WIDTH
 from arena_newton.rules import seeding
 from arena_newton.testing.findings import (
     CheckResult,
@@ -144,7 +145,7 @@ class _Trial:
         """Every promise in order."""
         asks = "an episode does not depend on when other worlds ask"
         return [
-            Promise("attributes", "name, picture, chunk size and dependence on worlds are declared", self.attributes),
+            Promise("attributes", "name, picture, chunk, labels, dependence on worlds are declared", self.attributes),
             Promise("chunk", f"act answers a Chunk of valid actions [worlds, n, {ACTION_WIDTH}]", self.chunk),
             Promise("seeds", "the same seeds and observations give the same actions again", self.seeded),
             Promise("reset", "reset begins an episode in its worlds and touches no other", self.resets),
@@ -236,9 +237,10 @@ class _Trial:
             len(chunk.phases) != worlds or not all(phase is None or isinstance(phase, str) for phase in chunk.phases)
         ):
             raise Violation(f"phases must be {worlds} texts or None: {chunk.phases}")
+        protocol = LABELS.get(getattr(self.policy, "labels", None) or "v3.1", LABELS["v3.1"])
         for world in np.flatnonzero(mask):
             try:
-                validate_action(actions[world].numpy(), f"world {world}")
+                protocol.validate(actions[world].numpy(), f"world {world}")
             except InputError as error:
                 raise Violation(str(error)) from None
         standing = torch.from_numpy(STAND_ACTION).expand_as(actions)
@@ -269,6 +271,8 @@ class _Trial:
             raise Violation(f"name is {policy.name!r}, expected a text")
         if not isinstance(policy.needs_image, bool):
             raise Violation(f"needs_image is {policy.needs_image!r}, expected True or False")
+        if (labels := getattr(policy, "labels", None)) not in (None, *LABELS):
+            raise Violation(f"labels are {labels!r}, expected one of {', '.join(LABELS)} or None")
         camera, size = getattr(policy, "camera", None), getattr(policy, "chunk_size", 1)
         if camera is not None and not isinstance(camera, CameraConfig):
             raise Violation(f"camera is a {type(camera).__name__}, expected a CameraConfig or None")

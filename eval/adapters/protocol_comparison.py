@@ -9,11 +9,9 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
-import shlex
+import re
 import signal
 import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,7 +21,7 @@ import numpy as np
 
 from arena_newton import tasks
 from arena_newton.cli.extras import require
-from arena_newton.cli.flags import user_path, words
+from arena_newton.cli.flags import shell_command, user_path, words
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
@@ -31,7 +29,7 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.journal import StorageError, write_atomic
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import end, environment, start_module
 from arena_newton.pages.tables import Table
 from arena_newton.policies.learned.learned_card import CARD_FILE, SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import checkpoint_folder
@@ -43,10 +41,10 @@ SERVED = ("openpi", "roboarena", "vla-eval", "arena")
 """Protocols behind a server."""
 SAME_BITS = tuple(name for name in PROTOCOLS if name != "learned")
 """Protocols that promise the bits of `lerobot` on engine mujoco and the CPU."""
-PYTHON = (sys.executable, "-P")
-"""Interpreter of the processes, which does not look for packages in the folder of the call."""
 START_S = 300.0
 """Longest wait until a server listens [s]."""
+POLL = 0.1
+"""Its output is looked at so often [s]."""
 END_S = 30.0
 """Longest wait until it ends [s]."""
 ADDRESS = "eval asks it by --policy "
@@ -75,7 +73,7 @@ class ProtocolRun:
     protocol: str
     episodes: tuple[ProtocolEpisode, ...]
     seconds: float
-    """From its start to its end [s]."""
+    """Time from its start to its end [s]."""
     commands: tuple[str, ...] = ()
     """Command lines, as a user types them."""
 
@@ -88,7 +86,7 @@ class ProtocolRow:
     successes: int
     episodes: int
     steps: tuple[int, ...]
-    """Of each episode."""
+    """Steps of each episode."""
     same_endings: bool
     """Outcome, reason and steps of every episode are those of the first protocol."""
     same_actions: bool
@@ -264,7 +262,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
                 served = ["arena_newton.policies.serve", "--policy", f"lerobot:{checkpoint}", "--protocol", protocol]
                 served += ["--port", "0", "--task", options.task, "--tracker", options.tracker]
                 served += ["--device", options.device]
-                commands.append([*PYTHON, "-m", *served])
+                commands.append(served)
                 spec = stack.enter_context(_server(protocol, commands[0], folder / "server.txt"))
             commands.append(_run_command(options, spec, found))
             _call(protocol, commands[-1], folder / "output.txt", (0, 1))
@@ -274,9 +272,7 @@ def _play(protocol: str, options: ProtocolOptions, checkpoint: Path, folder: Pat
     for key, (outcome, reason, steps, margin) in endings.items():
         path = found / "actions" / f"{options.task}_base_{key.replace('/', '_')}.npz"
         episodes.append(ProtocolEpisode(key, outcome, reason, steps, margin, _actions(path)))
-    return ProtocolRun(
-        protocol, tuple(episodes), seconds, tuple(shlex.join(["python", *line[len(PYTHON) :]]) for line in commands)
-    )
+    return ProtocolRun(protocol, tuple(episodes), seconds, tuple(shell_command(*line) for line in commands))
 
 
 def _actions(path: Path) -> np.ndarray:
@@ -302,12 +298,12 @@ def _run_command(options: ProtocolOptions, spec: str, folder: Path) -> list[str]
         actions=True,
         out=str(folder),
     )
-    return [*PYTHON, "-m", "arena_newton.eval", "run", *words(flags)]
+    return ["arena_newton.eval", "run", *words(flags)]
 
 
 def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> list[str]:
     """LeRobot's own command line: one world a batch, so that each forward pass has one row as on our CPU."""
-    line = [*PYTHON, "-m", "lerobot.scripts.lerobot_eval"]
+    line = ["lerobot.scripts.lerobot_eval"]
     line += ["--env.discover_packages_path=arena_newton.eval.adapters.lerobot_env", "--env.type=arena_newton"]
     line += [f"--env.task={options.task}", f"--env.tracker={options.tracker}", f"--env.engine={options.engine}"]
     line += [f"--env.device={options.device}", f"--env.episodes={folder}", f"--policy.path={checkpoint}"]
@@ -316,13 +312,22 @@ def _stock_command(options: ProtocolOptions, checkpoint: Path, folder: Path) -> 
     return line if options.max_steps is None else [*line, f"--env.episode_length={options.max_steps}"]
 
 
+def _start(command: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
+    """A program, whose output goes into a file."""
+    variables = environment(one_thread=True)
+    with log.open("wb") as file:
+        return start_module(*command, variables=variables, output=file.fileno(), errors=subprocess.STDOUT, apart=False)
+
+
 def _call(protocol: str, command: Sequence[str], log: Path, allowed: Sequence[int]) -> None:
-    """Run a program, whose output goes into a file."""
-    with log.open("w") as file:
-        done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, env=environment(one_thread=True))
-    if done.returncode not in allowed:
-        why = f"exit code {done.returncode}, {_last_line(log)}"
-        raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
+    """Run a program to its end."""
+    process = _start(command, log)
+    try:
+        code = process.wait()
+    finally:
+        end(process, END_S, signal.SIGINT)
+    if code not in allowed:
+        raise InputError(f"protocol {protocol}: exit code {code}, {_last_line(log)}; all of it is in {log}")
 
 
 def _last_line(log: Path) -> str:
@@ -333,40 +338,16 @@ def _last_line(log: Path) -> str:
 @contextlib.contextmanager
 def _server(protocol: str, command: Sequence[str], log: Path) -> Iterator[str]:
     """A server that listens; gives the policy by which it is asked."""
-    with log.open("w") as errors:
-        made = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment(one_thread=True)
-        )
-    lines: list[str] = []
-    listens = threading.Event()
-
-    def read() -> None:
-        assert made.stdout is not None
-        for line in made.stdout:
-            lines.append(line.rstrip("\n"))
-            if line.startswith(ADDRESS):
-                listens.set()
-        listens.set()
-
-    reader = threading.Thread(target=read, daemon=True)
-    reader.start()
+    made, until = _start(command, log), time.monotonic() + START_S
     try:
-        listens.wait(START_S)
-        found = [line.removeprefix(ADDRESS) for line in lines if line.startswith(ADDRESS)]
-        if not found:
-            why = f"its server does not listen, {_last_line(log)}"
-            raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
-        yield found[0]
+        while not (found := re.search(f"^{ADDRESS}(.*)\n", log.read_text(errors="replace"), re.MULTILINE)):
+            if made.poll() is not None or time.monotonic() > until:
+                why = f"its server does not listen, {_last_line(log)}"
+                raise InputError(f"protocol {protocol}: {why}; all of it is in {log}")
+            time.sleep(POLL)
+        yield found[1]
     finally:
-        made.send_signal(signal.SIGINT)
-        try:
-            made.wait(END_S)
-        except subprocess.TimeoutExpired:
-            made.kill()
-            made.wait()
-        reader.join(END_S)
-        with contextlib.suppress(OSError), log.open("a") as file:
-            file.write("\n".join(lines) + "\n")
+        end(made, END_S, signal.SIGINT)
 
 
 type Ending = tuple[str, str | None, int, float | None]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.cli.flags import Device, Engine
+
 __all__ = ["PROTOCOLS", "ProtocolOptions"]
 
 PROTOCOLS = ("lerobot", "learned", "lerobot-eval", "openpi", "roboarena", "vla-eval", "arena")
@@ -33,9 +35,7 @@ class ProtocolOptions:
     """Actions of each episode that are compared bit for bit."""
     max_steps: int | None = None
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
-    engine: str = "mujoco"
-    """Physics engine: mujoco or warp."""
-    device: str = "cpu"
-    """Device of worlds and networks: cpu, cuda."""
+    engine: Engine = "mujoco"
+    device: Device[str] = "cpu"
     out: str = "protocols"
     """Folder of the episodes, the programs' output and the table; must be empty or new."""

@@ -9,9 +9,10 @@ import dataclasses
 import math
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from arena_newton.errors import InputError
-from arena_newton.eval.audit.asked_again import AskedAgain, RecordedQueries
+from arena_newton.eval.audit.asked_again import Answers, AskedAgain, RecordedQueries
 from arena_newton.eval.audit.folder_audit import Audit
 from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
@@ -30,7 +31,7 @@ from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
 from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
 
-__all__ = ["ENGINE", "drawn", "found_probability", "replay", "rollout_flags", "stored_cameras"]
+__all__ = ["ENGINE", "drawn", "found_probability", "replay", "played", "rollout_flags", "stored_cameras", "through"]
 
 COMPARED = "outcome reason steps margin startup_fall overflow predicates progress events".split()
 """Keys of a line that a replay must give again, numbers to the last bit."""
@@ -68,13 +69,12 @@ def found_probability(forged: float, episodes: int) -> float:
     return 1.0 - (1.0 - forged) ** episodes
 
 
-def rollout_flags(stored: RunOptions, tracker: str, policy: str, *kinds: type) -> dict[str, object]:
-    """Flags by which a run through one tracker is played here with a policy, with those of more kinds."""
-    more = (*flags_of(Remote),) if policy.startswith("remote:") else ()
-    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
-    names = (*groups_of, *more, "task", "seeds", "repeats", "checkpoint")
-    same = {name: getattr(stored, name) for name in names}
-    return same | {"policy": policy, "tracker": (tracker,), "engine": ENGINE, "device": "cpu", "actions": False}
+def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
+    """Flags by which the episodes of a run are played here with a policy, and flags of more kinds of the run."""
+    more = (Remote,) if policy.startswith("remote:") else ()
+    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds, *more) for name in flags_of(kind))
+    same = {name: getattr(stored, name) for name in (*groups_of, "task", "tracker", "seeds", "repeats", "checkpoint")}
+    return RunOptions(**same | {"policy": policy, "engine": ENGINE, "device": "cpu", "actions": False})
 
 
 def replay(
@@ -108,69 +108,109 @@ def replay(
         raise InputError(f"{where} {engine}; ticks are checked one by one where states were recorded (--record)")
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
-    wanted = {(r.task, r.tracker, r.mode, r.group_seed, r.repeat): r for r in records}
-    largest, furthest, compared, equal = 0.0, 0.0, 0, 0
-    for tracker in dict.fromkeys(record.tracker for record in records):
-        actions = run.folder / actions_folder(stored.tracker, tracker)
-        config = resolve(RunOptions(**rollout_flags(stored, tracker, f"replay:{actions}")))  # type: ignore[arg-type]
-        chosen = [e for e in config.episodes if (e.task, tracker, e.mode, e.group_seed, e.repeat) in wanted]
-        config, player = check_parts(dataclasses.replace(config, episodes=tuple(chosen)), made)
-        _note_differences(audit, config, ("code", "scenes", "rules_hash"))
-        again: Policy | None = None
-        try:
-            if policy is not None:
-                other = resolve(RunOptions(**rollout_flags(stored, tracker, policy, Chunks)))  # type: ignore[arg-type]
-                other, again = check_parts(dataclasses.replace(other, episodes=tuple(chosen)), made)
-                _note_differences(audit, other, ("policy", "policy_file", "policy_facts", "labels"))
-            for (task, _, mode), group in groups(chosen).items():
-                cameras = stored_cameras(audit, f"{task} {tracker} {mode}") if again is None else other.cameras
-                config = dataclasses.replace(config, cameras=cameras)
-                lines = {e.index: wanted[e.task, tracker, e.mode, e.group_seed, e.repeat] for e in group}
-                recorded = {
-                    i: RecordedQueries.read(run.folder / line.media["actions"])
-                    for i, line in lines.items()
-                    if line.media is not None
-                }
-                seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
-                states = StatesAgain({i: run.folder / (one.media or {}).get(EPISODE, "") for i, one in lines.items()})
-                for result in played(config, made, player, group, [states, seen] if by_tick else [seen]):
-                    index = result.episode.index
-                    if by_tick:
-                        _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
-                        furthest = max(furthest, *states.differences[index][1:])
-                    else:
-                        _compare(audit, lines[index], result, seen.taken(index)[1])
-                for index, answers in seen.answers.items():
-                    largest = max(largest, answers.largest)
-                    compared, equal = compared + answers.asked, equal + answers.equal
-                    name = f"{run.folder / JOURNAL_FILE}: episode {lines[index].index}"
-                    if answers.error is not None or not recorded[index].queries:
-                        cause = answers.error or "its actions do not say when the policy was asked"
-                        audit.faults.append(f"{name}: the policy cannot be asked again: {cause}")
-                    elif answers.first is not None:
-                        audit.faults.append(
-                            f"{name}: at tick {answers.first} the policy decides otherwise; actions differ by up to "
-                            f"{answers.largest:.3g}"
-                        )
-        finally:
-            player.close()
-            if again is not None:
-                again.close()
+    totals = _Totals()
+    if records:
+        _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tick_tolerance=tick_tolerance)
     audit.replayed = len(records)
     odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
     sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
     if by_tick:
         audit.notes.append(
-            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. The state "
-            f"after it has bodies {furthest:.2g} m off at most (--tick-tolerance {tick_tolerance:g}), no bit counts."
+            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. Bodies "
+            f"are {totals.furthest:.2g} m off at most (--tick-tolerance {tick_tolerance:g}), no bit counts."
         )
     if policy is not None:
         audit.asked = len(records)
         audit.notes.append(
-            f"The policy was asked again: {equal} of {counted(compared, 'action')} are equal to the bit, the largest "
-            f"difference is {largest:.3g} (--tolerance {tolerance:g})."
+            f"The policy was asked again: {totals.equal} of {counted(totals.compared, 'action')} are equal to the bit, "
+            f"the largest difference is {totals.largest:.3g} (--tolerance {tolerance:g})."
         )
+
+
+@dataclass
+class _Totals:
+    """Sums over the episodes of an audit."""
+
+    compared: int = 0
+    """Actions of a policy that was asked again."""
+    equal: int = 0
+    largest: float = 0.0
+    """Largest difference of one."""
+    furthest: float = 0.0
+    """Largest distance of a body after a tick [m]."""
+
+
+def _play(
+    audit: Audit,
+    stored: RunOptions,
+    records: Sequence[EpisodeRecord],
+    made: Factories,
+    policy: str | None,
+    tolerance: float,
+    totals: _Totals,
+    *,
+    by_tick: bool,
+    tick_tolerance: float,
+) -> None:
+    """Play these episodes of a folder's plan, and compare each."""
+    run, wanted = audit.run, {_key(record): record for record in records}
+    plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
+    _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
+    asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
+    for tracker in dict.fromkeys(record.tracker for record in records):
+        actions = run.folder / actions_folder(stored.tracker, tracker)
+        chosen = tuple(episode for episode in plan.episodes if episode.tracker == tracker and _key(episode) in wanted)
+        config = dataclasses.replace(through(plan, tracker, chosen), policy=f"replay:{actions}")
+        config, player = check_parts(config, made)
+        again: Policy | None = None
+        try:
+            if policy is not None:
+                other, again = check_parts(through(asked, tracker, chosen), made)
+                _note_differences(audit, other, ("policy", "policy_file", "policy_facts", "labels"))
+            for (task, _, mode), group in groups(chosen).items():
+                cameras = stored_cameras(audit, f"{task} {tracker} {mode}") if again is None else other.cameras
+                lines = {episode.index: wanted[_key(episode)] for episode in group}
+                media = {index: line.media or {} for index, line in lines.items()}
+                recorded = {i: RecordedQueries.read(run.folder / files["actions"]) for i, files in media.items()}
+                seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
+                states = StatesAgain({i: run.folder / files.get(EPISODE, "") for i, files in media.items()})
+                recorders = [states, seen] if by_tick else [seen]
+                for result in played(dataclasses.replace(config, cameras=cameras), made, player, group, recorders):
+                    index = result.episode.index
+                    if by_tick:
+                        _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
+                        totals.furthest = max(totals.furthest, *states.differences[index][1:])
+                    else:
+                        _compare(audit, lines[index], result, seen.taken(index)[1])
+                for index, answers in seen.answers.items():
+                    _judge_answers(audit, lines[index], answers, totals)
+        finally:
+            player.close()
+            if again is not None:
+                again.close()
+
+
+def through(plan: RunConfig, tracker: str, chosen: tuple[Episode, ...]) -> RunConfig:
+    """The part of a plan that one tracker executes."""
+    return dataclasses.replace(plan, flags=dataclasses.replace(plan.flags, tracker=(tracker,)), episodes=chosen)
+
+
+def _judge_answers(audit: Audit, record: EpisodeRecord, answers: Answers, totals: _Totals) -> None:
+    """Add a policy's answers at the queries of an episode to the sums, and what contradicts to the audit."""
+    totals.compared, totals.equal = totals.compared + answers.asked, totals.equal + answers.equal
+    totals.largest = max(totals.largest, answers.largest)
+    where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
+    if answers.error is not None or not answers.asked:
+        cause = answers.error or "its actions do not say when the policy was asked"
+        audit.faults.append(f"{where}: the policy cannot be asked again: {cause}")
+    elif answers.first is not None:
+        differ = f"actions differ by up to {answers.largest:.3g}"
+        audit.faults.append(f"{where}: at tick {answers.first} the policy decides otherwise; {differ}")
+
+
+def _key(one: EpisodeRecord | Episode) -> tuple[object, ...]:
+    return one.task, one.tracker, one.mode, one.group_seed, one.repeat
 
 
 def played(

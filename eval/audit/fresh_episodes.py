@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections import Counter
 
-from arena_newton.eval.audit.action_replay import played, rollout_flags
+from arena_newton.eval.audit.action_replay import played, rollout_flags, through
 from arena_newton.eval.audit.folder_audit import Audit
 from arena_newton.eval.folders.run_folder import stored_options
 from arena_newton.eval.plan.config import resolve
-from arena_newton.eval.plan.options import Chunks, RunOptions
+from arena_newton.eval.plan.options import Chunks
 from arena_newton.eval.play.run import Factories, check_parts
 from arena_newton.eval.play.run_flow import Group, groups
 from arena_newton.eval.records.journal import JOURNAL_FILE
@@ -41,11 +42,13 @@ def play_fresh(audit: Audit, policy: str, number: int, seed: int, factories: Fac
     stored = stored_options(run.folder)
     drawn = random.Random(f"fresh {audit.head} {seed}").choice(SEEDS)
     won = Counter[Group]()
+    flags = dataclasses.replace(rollout_flags(stored, policy, Chunks), seeds=(drawn,), repeats=number)
+    plan = resolve(flags)
     for tracker in stored.tracker:
-        flags = rollout_flags(stored, tracker, policy, Chunks) | {"seeds": (drawn,), "repeats": number}
-        config, player = check_parts(resolve(RunOptions(**flags)), made)  # type: ignore[arg-type]
+        chosen = tuple(episode for episode in plan.episodes if episode.tracker == tracker)
+        config, player = check_parts(through(plan, tracker, chosen), made)
         try:
-            for cell, group in groups(config.episodes).items():
+            for cell, group in groups(chosen).items():
                 won[cell] = sum(result.outcome == "success" for result in played(config, made, player, group))
         finally:
             player.close()

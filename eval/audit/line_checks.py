@@ -172,7 +172,7 @@ def action_faults(run: RunRecord, records: Sequence[EpisodeRecord], lacking: lis
             lacking.append(record.index)
             continue
         try:
-            arrays = read_arrays(run.folder / path)
+            arrays = read_arrays(run.folder / path, content=data)
         except InputError as error:
             yield str(error)
             continue

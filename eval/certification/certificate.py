@@ -24,7 +24,7 @@ __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 
 FILE = "certify.json"
 FEW = 20
-"""Fewer episodes of a cell than this are said to be few."""
+"""Number of episodes below which a cell is marked as having few."""
 MEANING = {
     "pass": "holds",
     "fail": "does not hold",
@@ -137,7 +137,7 @@ def _warnings(facts: Facts) -> list[str]:
 
 
 def _measured(one: ClaimFinding) -> list[tuple[str, str]]:
-    """Of a claim each check's name and what it measured."""
+    """Names of a claim's checks, with what each measured."""
     skipped = {"skip": "not measured: "}
     return [(check.name, f"{skipped.get(finding.verdict, '')}{finding.summary}") for check, finding in one.findings]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Device, Engine, Several
 from arena_newton.eval.plan.options import Jobs
 
 __all__ = ["CertifyOptions"]
@@ -34,10 +34,8 @@ class CertifyOptions(Jobs):
     """Episodes of each cell: 60, the protocol's, or 2 under --quick."""
     worlds: int = 20
     """Episodes simulated at once."""
-    engine: str = "mujoco"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1."""
+    engine: Engine = "mujoco"
+    device: Device[str | None] = None
     twist2_checkpoint: str | None = None
     """Official TWIST2 checkpoint (.onnx), to compare our weights with."""
     resume: bool = False

@@ -12,7 +12,7 @@ from arena_newton.files.text import counted
 __all__ = ["CLAIMS", "Claim", "ClaimFinding", "claimed", "verdict_of"]
 
 WORST_FIRST: tuple[Verdict, ...] = ("fail", "note", "pass", "skip")
-"""Of several checks the first of these is a claim's verdict: what was not measured says nothing against it."""
+"""Order of verdicts: a claim's is the first that one of its checks has; what was not measured counts last."""
 
 WORDS: Mapping[Verdict, tuple[str, str]] = {
     "fail": ("does not hold", "do not hold"),
@@ -20,7 +20,7 @@ WORDS: Mapping[Verdict, tuple[str, str]] = {
     "note": ("holds with what its notes say", "hold with what their notes say"),
     "skip": ("was not measured", "were not measured"),
 }
-"""Verdict → what is said of one claim and of several."""
+"""Verdict → its wording for one claim and for several."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
 from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
-from arena_newton.files.stored_json import Json
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
+from arena_newton.files.stored_json import Json, read_object
 from arena_newton.files.text import counted
 from arena_newton.rules import seeding
 
@@ -205,8 +206,8 @@ class Context:
         known = config_hash([self._ground(played, through), dict(settings)])
         name = f"{name}_{task}_{tracker}" if isinstance(task, str) else name
         path = self.folder / "measured" / f"{name}.json"
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            stored = json.loads(path.read_text(encoding="utf-8"))
+        with contextlib.suppress(InputError, ValueError, KeyError):
+            stored = read_object(path, MAX_CONFIG_BYTES)
             if stored["known_by"] == known and stored["digest"] == config_hash(stored["value"]):
                 value: Json = stored["value"]
                 return value

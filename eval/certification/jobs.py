@@ -1,6 +1,7 @@
 """Certification by several processes, which play into the folder that the page is made from.
 
-Each plays one check of one task, through one tracker where the check measures trackers apart.
+Each plays one check of one task, through one tracker where the check measures trackers apart. The worker pool
+cannot play them: it deals episodes of one run, and a check plays runs of many kinds and compares them.
 """
 
 from __future__ import annotations
@@ -8,17 +9,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import queue
 import subprocess
-import sys
-import threading
+import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from typing import BinaryIO
 
 from arena_newton.cli.flags import shell_command, words
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.agreement import BATCHED_TASKS
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import environment, how_it_ended, start_module
 from arena_newton.physics.devices import resolve_engine
 from arena_newton.tasks import get
 
@@ -70,6 +71,8 @@ OF_FIRST_TASKS = {"batches": BATCHED_TASKS, "recording": 1, "policy-inputs": 1, 
 """Checks that under --quick play the first tasks alone, and how many of them."""
 PLAYS_NOTHING = ("statistics",)
 """Checks that are left to the end."""
+POLL = 0.1
+"""Processes are looked at so often [s]."""
 
 
 def play_ahead(
@@ -135,48 +138,47 @@ def _quick_pieces(options: CertifyOptions, tasks: Sequence[str], checks: Sequenc
 
 def _work(options: CertifyOptions, pieces: Sequence[Piece], say: Callable[[str], None]) -> None:
     """Play pieces until none is left."""
-    waiting: queue.SimpleQueue[Piece] = queue.SimpleQueue()
-    for piece in pieces:
-        waiting.put(piece)
-    cores = sorted(os.sched_getaffinity(0))
-    running: set[subprocess.Popen[bytes]] = set()
-    stopped = threading.Event()
-
-    def work(slot: int) -> None:
-        own = cores[slot :: options.jobs] or cores[slot % len(cores) :][:1]
-        variables = environment() | {"OMP_NUM_THREADS": str(len(own))}
-        while not stopped.is_set():
-            try:
-                piece = waiting.get_nowait()
-            except queue.Empty:
-                return
-            command = [sys.executable, "-P", "-m", "arena_newton.eval", "certify", *flags(options, piece)]
-            process = subprocess.Popen(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-            running.add(process)
-            if piece.cores:
-                with contextlib.suppress(ProcessLookupError):
-                    os.sched_setaffinity(process.pid, own)
-            _, complaint = process.communicate()
-            running.discard(process)
-            last = complaint.decode(errors="replace").strip().splitlines()[-1:]
-            ended = "played" if process.returncode in (0, 1) else f"left to the end: {''.join(last)}"
-            if not stopped.is_set():
-                say(f"{piece}: {ended}")
-
-    threads = [threading.Thread(target=work, args=(slot,)) for slot in range(min(options.jobs, len(pieces)))]
-    for thread in threads:
-        thread.start()
+    waiting, cores = deque(pieces), sorted(os.sched_getaffinity(0))
+    running: dict[int, tuple[Piece, subprocess.Popen[bytes], BinaryIO]] = {}
     try:
-        while any(thread.is_alive() for thread in threads):
-            time.sleep(0.1)  # an interrupt gets through here, but not through a join
-    except BaseException:
-        # What was asked to stop keeps what it played; nobody takes another piece.
-        stopped.set()
-        for process in list(running):
+        while waiting or running:
+            for slot in range(options.jobs):
+                if waiting and slot not in running:
+                    own = cores[slot :: options.jobs] or cores[slot % len(cores) :][:1]
+                    running[slot] = _start(options, waiting.popleft(), own)
+            time.sleep(POLL)
+            for slot, (piece, process, errors) in list(running.items()):
+                if process.poll() is not None:
+                    del running[slot]
+                    say(f"{piece}: {_ending(process, errors)}")
+    finally:  # what was asked to stop keeps what it played
+        for _, process, _ in running.values():
             process.terminate()
-        for thread in threads:
-            thread.join()
-        raise
+        for _, process, _ in running.values():
+            process.wait()
+
+
+def _start(
+    options: CertifyOptions, piece: Piece, own: Sequence[int]
+) -> tuple[Piece, subprocess.Popen[bytes], BinaryIO]:
+    """A piece, its process with cores of its own, and the file of its errors."""
+    variables, errors = environment() | {"OMP_NUM_THREADS": str(len(own))}, tempfile.TemporaryFile()
+    command = ("arena_newton.eval", "certify", *flags(options, piece))
+    process = start_module(*command, variables=variables, errors=errors.fileno(), apart=False)
+    if piece.cores:
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setaffinity(process.pid, own)
+    return piece, process, errors
+
+
+def _ending(process: subprocess.Popen[bytes], errors: BinaryIO) -> str:
+    """Ending of a piece's process in words."""
+    with errors:
+        errors.seek(0)
+        last = errors.read().decode(errors="replace").strip().splitlines()[-1:]
+    if process.returncode in (0, 1):
+        return "played"
+    return f"left to the end: {''.join(last) or how_it_ended(process, 0.0)}"
 
 
 def flags(options: CertifyOptions, piece: Piece) -> list[str]:

@@ -126,7 +126,7 @@ class _Found:
     episodes: int
 
     def lines(self) -> list[str]:
-        """In words."""
+        """Lines for the console."""
         from arena_newton.eval.studies.placement_files import rate_text
 
         parts = [f"mean over the range: {rate_text(*self.mean)}"]

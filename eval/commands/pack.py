@@ -143,11 +143,11 @@ def _trainings(folders: Sequence[Path], facts: CheckpointFacts, digests: Sequenc
             "--trainings", [folder], lambda weights: weights not in ("", *digests), "another training"
         )
         for run in runs:
-            said = run.config.get("policy_facts") or {}
+            stated = run.config.get("policy_facts") or {}
             for name, value in ours.items():
-                if name in said and said[name] != value:
+                if name in stated and stated[name] != value:
                     raise InputError(f"--trainings {folder}: is of another {name} than this checkpoint")
-            seeds[str(said.get("weights"))] = int(said.get("seed") or 0)
+            seeds[str(stated.get("weights"))] = int(stated.get("seed") or 0)
         for cell in cells:
             found.setdefault(cell.weights, []).append(cell)
     return tuple(

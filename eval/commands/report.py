@@ -26,7 +26,7 @@ class ReportOptions:
     json: bool = False
     """Print results.json instead of the table."""
     own_tracker: str | None = None
-    """Of a swapped run with --failures: first play its actions through this tracker, the one that the
+    """Tracker through which --failures first plays the actions of a swapped run: the one that the
     policy was trained with, into <out>/own; the report then says how many failures succeed so."""
 
 

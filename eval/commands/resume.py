@@ -35,7 +35,7 @@ def run(folders: Sequence[Path], options: RunOptions, factories: Factories | Non
     """
     (folder,), stored = folders, defaults(folders)
     if stored.until_width is not None and options.max != stored.max:
-        raise InputError(f"--max was {stored.max}, now {options.max}: it was said before the first episode, and stays")
+        raise InputError(f"--max was {stored.max}, now {options.max}: it was fixed before the first episode")
     if options.out != str(folder):
         raise InputError(f"resume {folder}: continues in that folder; drop --out {options.out}")
     return evaluate(options, factories)

@@ -101,7 +101,7 @@ def run(folders: Sequence[Path], options: TablesOptions) -> int:
 
 
 def _sources(folders: Sequence[Path], cells: CellSet) -> list[str]:
-    """Of what findings are made, and by which command."""
+    """Sources of the findings, and the command that makes them."""
     return [f"Made by {shell_command('arena_newton.eval', 'tables', *folders, '--findings')}", *cells.notes]
 
 

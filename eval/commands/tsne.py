@@ -39,9 +39,9 @@ class TsneOptions:
     out: str = "tsne"
     """Folder to write: tsne.json, and one picture per task."""
     seed: int = 0
-    """Of the embedding and of the policy's noise."""
+    """Seed of the embedding and of the policy's noise."""
     perplexity: float = 30.0
-    """Of the embedding."""
+    """Perplexity of the embedding."""
     batch: int = 50
     """Observations that the policy is given at once."""
 
@@ -164,7 +164,7 @@ def _line(task: str, one: ActionMap, result: JsonObject) -> str:
     ]
     number = result["samples_per_source"]
     sources = f"{number} + {number} observations of {one.names[0]} and {one.names[1]}"
-    return f"{task}: {sources}; source told {', '.join(accuracies)}; chance 50 %"
+    return f"{task}: {sources}; source predicted {', '.join(accuracies)}; chance 50 %"
 
 
 def _title(spec: str) -> str:

@@ -1,4 +1,4 @@
-"""At which stage an episode failed: the taxonomy of the paper's appendix on failures as rules over recorded signals.
+"""Stage at which an episode failed: the taxonomy of the paper's appendix on failures as rules over recorded signals.
 
 Pure and deterministic: an episode's line of the journal in, one stage out. The paper names six stages in words; what
 they mean here is this file. A failure gets the first stage that broke down, from the robot outward: what the tracker

@@ -19,7 +19,7 @@ class FailureStage(StrEnum):
     CONTACT = "contact"
     """The object is touched without the effect that the task wants."""
     RECOVERY = "recovery"
-    """After a touch the robot falls, or does not follow an object that moved away."""
+    """Falls after a touch, or does not follow an object that moved away."""
     TRACKING = "tracking (legs)"
     """The legs do not do what a plausible reference says."""
 

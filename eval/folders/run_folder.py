@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import datetime
 import json
+import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,11 +20,11 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records import document as documents
 from arena_newton.eval.records.document import CONFIG_FILE, Document, read_document
 from arena_newton.eval.records.identity import config_hash, differing_key, moving_versions
-from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, write_atomic
+from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeLines, EpisodeRecord, Journal, write_atomic
 from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.files.stored_json import JsonObject, check_types
-from arena_newton.files.text import plain_text
+from arena_newton.files.text import counted, plain_text
 from arena_newton.pictures.settings import CameraConfig
 
 __all__ = [
@@ -167,6 +168,34 @@ class ResultsFolder:
             )
         return stored
 
+    @property
+    def parts(self) -> Sequence[ResultsFolder]:
+        """Folders that hold the run's results: this one."""
+        return (self,)
+
+    @contextlib.contextmanager
+    def opened(self, config: RunConfig) -> Iterator[EpisodeLines]:
+        """The journal of the folder, prepared for the run; what is unfinished is removed at the end of the block.
+
+        `config` has what tracker and policy say of themselves. A torn last line is cut.
+
+        Raises:
+            InputError: The folder cannot be the run's, or another process writes it.
+            StorageError: It cannot be written.
+        """
+        self.make()
+        with Journal(self.journal) as journal:
+            self.prepare(config, journal.records)
+            self.remove_unfinished()
+            if journal.torn_bytes:
+                print(
+                    f"  cut a torn last line of {counted(journal.torn_bytes, 'byte')} off the journal", file=sys.stderr
+                )
+            try:
+                yield journal
+            finally:
+                self.remove_unfinished()
+
     def make(self) -> None:
         """Create the folder.
 
@@ -307,7 +336,7 @@ class ResultsFolder:
         """
         write_atomic(self.path / name, content)
 
-    def sweep(self) -> None:
+    def remove_unfinished(self) -> None:
         """Remove what unfinished recordings left."""
         for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial", f"actions/*/*{PARTIAL}"):
             for part in self.path.glob(pattern):

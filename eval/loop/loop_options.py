@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Device, Engine, Several
 
 __all__ = ["LoopOptions"]
 
@@ -36,10 +36,8 @@ class LoopOptions:
     """Seed of the training, and series of the recorded seeds."""
     worlds: int | None = None
     """Episodes simulated at once: 100 on CUDA and 20 on the CPU when none is given."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine, networks and training: cpu, cuda, cuda:1."""
+    engine: Engine = "auto"
+    device: Device[str | None] = None
     size: str | None = None
     """Size of the recorded pictures, which is what the policy sees: 224x224, or 64x64 under --small [px]."""
     max_steps: int | None = None

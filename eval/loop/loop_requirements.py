@@ -18,7 +18,7 @@ TICK_BYTES = 2_500
 TICK_PIXELS = 224 * 224
 """Pixels of that picture."""
 SUCCESS_FRACTION = 0.3
-"""Of the step budget, that a demonstration lasts: between a quarter (Boxing) and two thirds (VisNavi)."""
+"""Fraction of the step budget that a demonstration lasts: between a quarter (Boxing) and two thirds (VisNavi)."""
 MARGIN_BYTES = 50_000_000
 """Journals, reports, and strips of the evaluation [bytes]."""
 

@@ -98,7 +98,7 @@ class RunConfig:
     planned: int
     """Episodes of the whole plan."""
     repeats: int
-    """As in the flags, like the device, but never left open."""
+    """Repeats of the flags, never left open; the device likewise."""
     device: str
     policy: str
     """Spec that the policy is made with, a path in it as the user gave it."""
@@ -189,7 +189,7 @@ class RunConfig:
         return rounds.WidthRule(flags.until_width, flags.max or MOST_EPISODES, len(flags.seeds))
 
     def _budget(self) -> Identity:
-        """The rule that is said before the first episode; nothing where the plan is played as a whole."""
+        """The rule that is fixed before the first episode; nothing where the plan is played as a whole."""
         rule = self.width_rule
         return {} if rule is None else {"until_width": rule.width, "max": rule.most}  # type: ignore[typeddict-item]
 
@@ -231,6 +231,11 @@ class RunConfig:
             tracker_facts={name: _facts(tracker) for name, tracker in made.items()},
             policy_facts=_facts(policy) | ({"privileged": True} if is_privileged(policy) else {}),
         )
+
+    def described_by(self, other: object) -> RunConfig:
+        """The run with what trackers and policy say of themselves, of a run or a message that has them."""
+        described = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in described})
 
 
 def _facts(part: Tracker | Policy) -> JsonObject:

@@ -16,7 +16,7 @@ from arena_newton.files.text import plain_text, unprintable
 from arena_newton.pictures.settings import MOST_PORT, VIEWERS
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, DriveGains
 
-__all__ = ["DRIVES", "LABELS", "check_flags", "check_width", "check_workers"]
+__all__ = ["DRIVES", "check_flags", "check_width", "check_workers"]
 
 DRIVES: Mapping[str, DriveGains | None] = {
     "auto": None,
@@ -26,8 +26,6 @@ DRIVES: Mapping[str, DriveGains | None] = {
 """Drive gains of --drive; `auto` is what rule set and tracker ask for."""
 MOST_JOBS = 256
 """Processes of one machine that play."""
-LABELS = ("v3.1", "v4")
-"""Label protocols, `data.readers.label_protocols.LABELS`, which loads torch."""
 
 
 def check_flags(options: RunOptions) -> None:
@@ -43,9 +41,8 @@ def check_flags(options: RunOptions) -> None:
                 raise InputError(f"{flag_name(field.name)} {plain_text(text)}: {reason}")
     if options.drive not in DRIVES:
         raise InputError(f"--drive {options.drive}: unknown, choose from {', '.join(DRIVES)}")
-    if options.labels not in (None, *LABELS):
-        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
-    _check_chunks(options)
+    _check_latency(options)
+    options.check_chunks(options.policy)
     _check_shard(options)
     check_least(options, 1, "video_episodes", "worlds")
     for name in ("video_episodes", "video_size", "follow"):
@@ -71,11 +68,7 @@ def _check_belonging(options: Ray | RunOptions, group: type, flag: str, given: b
 
 def _check_policy(options: RunOptions) -> None:
     """Refuse flags of other policies."""
-    scheme = options.policy.partition(":")[0]
-    for name in ("replan", "ensemble"):
-        if getattr(options, name) and scheme != "lerobot":
-            raise InputError(f"{flag_name(name)}: belongs to --policy lerobot:<checkpoint>, not {options.policy}")
-    for name in () if scheme == "remote" else flags_of(Remote):
+    for name in () if options.policy.partition(":")[0] == "remote" else flags_of(Remote):
         if getattr(options, name) != getattr(Remote, name):
             raise InputError(f"{flag_name(name)}: belongs to --policy remote:<url>, not {options.policy}")
 
@@ -93,10 +86,9 @@ def _check_shard(options: RunOptions) -> None:
         raise InputError("--shard: does not go with --only-success, whose attempts follow from the earlier ones")
 
 
-def _check_chunks(options: RunOptions) -> None:
-    """Refuse ways to execute chunks that contradict each other; chunks that are too short show at the first query."""
+def _check_latency(options: RunOptions) -> None:
+    """Refuse a latency that outlasts what is executed; chunks that are too short show at the first query."""
     replan, late = options.replan, options.latency_ticks
-    check_least(options, 1, "replan")
     check_least(options, 0, "latency_ticks")
     if replan is not None and 0 < replan <= late:
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than --replan {replan}")

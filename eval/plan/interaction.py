@@ -51,7 +51,7 @@ class Interaction:
     loose: bool = False
     """It lies or stands free: a touch that has an effect moves it."""
     reached_only: bool = False
-    """To touch it is all that is wanted: a touch has no effect that could fail to come."""
+    """True if a touch is all that is wanted: it has no effect that could fail to come."""
     slow: float = 0.20
     """Speed of the root, averaged over half a second, below which the robot stands or steps slowly [m/s]: the experts
     strike and turn below it, and walk at 0.3 m/s and more."""

@@ -12,7 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from arena_newton.cli.flags import Several
+from arena_newton.cli.flags import Device, Engine, Several
+from arena_newton.policies.chunk_flags import ChunkFlags
 
 __all__ = [
     "QUICK_REPEATS",
@@ -65,17 +66,9 @@ class Tested:
 
 
 @dataclass(frozen=True)
-class Chunks:
-    """Protocol of a policy's actions, and how many of a chunk are executed."""
+class Chunks(ChunkFlags):
+    """Execution of a policy's chunks."""
 
-    labels: str | None = None
-    """Protocol of the policy's actions: v3.1, or v4 for one that was trained on labels of v4; what the policy says of
-    itself when none is named, and v3.1 where it says nothing."""
-    replan: int | None = None
-    """For --policy lerobot: execute only the first so many actions of each chunk, then query it again."""
-    ensemble: bool = False
-    """For --policy lerobot: execute at each tick the mean of all chunks that cover it; queried every 2 ticks, or as
-    --replan says."""
     latency_ticks: int = 0
     """Ticks of 0.02 s from a policy's query to the first action of its chunk; the chunk before goes on meanwhile."""
 
@@ -101,10 +94,8 @@ class Batch:
 
     worlds: int = 20
     """Episodes simulated at once."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
+    engine: Engine = "auto"
+    device: Device[str | None] = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 When successes are to be kept, the first round has as many attempts as are wanted, each later one as many as are missing
 still, until there are enough or the plan has no more. When an interval of some width is wanted, a round has
-`LOOK_EVERY` episodes, until the interval of the success rate is as narrow, or as many were played as were said before.
+`LOOK_EVERY` episodes, until the interval of the success rate is as narrow, or as many were played as were fixed before.
 
 What is due follows from the outcomes alone, so a run that was interrupted, or one with other worlds, plays the same
 episodes.
@@ -28,7 +28,7 @@ class WidthRule:
     """Rule by which a task, tracker and mode has enough episodes; printed before the first one is played."""
 
     width: float
-    """Of the 95 % interval of the success rate, 0 to 1."""
+    """Width of the 95 % interval of the success rate, 0 to 1."""
     most: int
     """Episodes at most."""
     seeds: int

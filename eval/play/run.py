@@ -47,7 +47,7 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.episode_signals import EpisodeSignals
-from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, StorageError
+from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecord, StorageError
 from arena_newton.eval.reports import console
 from arena_newton.eval.reports.progress import kernels_to_compile
 from arena_newton.files.own_files import file_label
@@ -64,7 +64,6 @@ from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
 
 __all__ = [
-    "EpisodeLines",
     "Factories",
     "ProgressSink",
     "RunPlayer",
@@ -101,7 +100,8 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
     began = time.perf_counter()
     if not _played(folder, factories or Factories()):
         return INTERRUPTED
-    return reported(folder, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return max(reported(part, seconds) for part in folder.parts)
 
 
 def _played(folder: ResultsFolder, factories: Factories) -> bool:
@@ -181,14 +181,11 @@ def _play(
     resume: str,
 ) -> bool:
     """Play what is missing; False when it was interrupted. Errors say how to go on: by the command `resume`."""
-    folder.make()
-    with Journal(folder.journal) as journal:
-        folder.prepare(config, journal.records)
-        folder.sweep()
+    with folder.opened(config) as journal:
         run = RunPlayer(config, folder, journal, factories, policy, viewer)
         try:
             with naming_the_command(resume, run.kept):
-                ended, waiting = begun(config, folder, journal)
+                ended, waiting = begun(config, folder, journal.records)
                 if waiting:
                     run.play(ended, waiting)
         except KeyboardInterrupt:
@@ -196,18 +193,7 @@ def _play(
             return False
         except PolicyUnavailable as error:
             raise RunStopped(f"{error}; {run.kept()}; when it is back: {resume}") from None
-        finally:
-            folder.sweep()
     return True
-
-
-class EpisodeLines(Protocol):
-    """Sink of finished episodes: the journal, or what passes them on to it."""
-
-    records: list[EpisodeRecord]
-
-    def append(self, record: EpisodeRecord) -> None:
-        """Take the record of an episode that ended."""
 
 
 class ProgressSink(Protocol):

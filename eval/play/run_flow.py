@@ -19,7 +19,7 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan import rounds
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.journal import EpisodeRecord, Journal, StorageError
+from arena_newton.eval.records.journal import EpisodeRecord, StorageError
 from arena_newton.eval.reports import console, report
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.files.text import counted
@@ -96,17 +96,15 @@ def group_of(config: RunConfig, episode: Episode) -> Group:
 
 
 def begun(
-    config: RunConfig, folder: ResultsFolder, journal: Journal
+    config: RunConfig, folder: ResultsFolder, records: Sequence[EpisodeRecord]
 ) -> tuple[dict[int, EpisodeRecord], dict[Group, list[Episode]]]:
-    """Say what is to be played in a folder that was prepared.
+    """Say what is to be played in a folder that was opened, and whose journal has these records.
 
     Returns:
         Finished episodes by number, and those to play next, by group; where none are left the folder is that of a
         finished run.
     """
-    if journal.torn_bytes:
-        print(f"  cut a torn last line of {counted(journal.torn_bytes, 'byte')} off the journal", file=sys.stderr)
-    ended = _finished_episodes(config, folder.path, journal.records)
+    ended = _finished_episodes(config, folder.path, records)
     waiting = due(config, ended)
     console.announce(config, folder.path, waiting)
     if not waiting:

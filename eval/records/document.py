@@ -80,7 +80,7 @@ class Identity(_Identity, total=False):
     ensemble: bool
     latency_ticks: Positive
     until_width: Annotated[float, Fit("a number from 0 to 1", lambda value: 0 < value < 1)]
-    """With `max`: width of the interval at which a task, tracker and mode has enough episodes. Absent without rule."""
+    """Width of the interval at which a task, tracker and mode has enough episodes, with `max`. Absent without rule."""
     max: Positive
     worlds: Annotated[float | None, Fit("a number or null")]
     rules_hash: Name
@@ -133,7 +133,7 @@ class Document(_Document, total=False):
     """Each environment's own description, by task, tracker and mode."""
     variant_changes: Annotated[list[str], Fit("sentences")]
     later_versions: Annotated[list[Versions], Fit("versions by library")]
-    """Of the libraries that a later `resume --accept-versions` ran with."""
+    """Versions of the libraries that a later `resume --accept-versions` ran with."""
     shard: Annotated[str, Fit("a shard such as 3/16", lambda value: read_shard(value) is not None)]
     """Part of the plan that the folder is of; absent where it is of all."""
     status: Annotated[Status, Fit("state, times and error of the run")]

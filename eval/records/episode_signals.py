@@ -29,7 +29,7 @@ class EpisodeSignals:
     looks: Count
     """Looks at the head camera's picture, one each `signal_recorder.EVERY` ticks until the first touch."""
     looks_seen: Count
-    """Of these the ones that showed the object."""
+    """Number of these that showed the object."""
     first_pixels: Count
     """Pixels of the object in the first picture."""
     first_seen: MaybeTick

@@ -70,7 +70,7 @@ UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm
 
 
 LARGE_BYTES = 8 << 20
-"""From this size on a hash is kept [bytes]; nothing that is edited by hand is so large."""
+"""Size from which on a hash is kept [bytes]; nothing that is edited by hand is so large."""
 
 
 def config_hash(value: object) -> str:
@@ -137,7 +137,7 @@ def differing_key(
 
 
 def moving_versions(versions: Mapping[str, str | None]) -> dict[str, str | None]:
-    """Of all versions those that an episode may depend on; of Python's the first two numbers."""
+    """Versions that an episode may depend on; of Python's the first two numbers."""
     kept = {name: version for name, version in versions.items() if name not in UNVERSIONED}
     if kept.get("python"):
         kept["python"] = ".".join(str(kept["python"]).split(".")[:2])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -13,11 +13,12 @@ import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Protocol, Self
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.records.episode_signals import EpisodeSignals
 from arena_newton.eval.records.schema import Count, Mode, Positive, Seed, Task, check_schema, read_lines
+from arena_newton.files.new_folder import held
 from arena_newton.files.own_files import replace_atomically
 from arena_newton.files.stored_json import Fit, Json, JsonObject, Name, is_name, loaded
 from arena_newton.files.text import counted
@@ -30,6 +31,7 @@ __all__ = [
     "JOURNAL_FILE",
     "SCHEMA",
     "ContradictionError",
+    "EpisodeLines",
     "EpisodeRecord",
     "Journal",
     "LockedLines",
@@ -91,7 +93,7 @@ class EpisodeRecord:
     max_steps: Ticks
     """Step budget."""
     hashes: Annotated[dict[Name, Name | None], Fit("hashes by name")] = field(default_factory=dict)
-    """Of configuration, rules, checkpoint, policy, variant, the libraries' versions and the environment."""
+    """Hashes of configuration, rules, checkpoint, policy, variant, the libraries' versions and the environment."""
     outcome: Outcome
     reason: Cause = ""
     """Finer cause, such as `startup_fall`."""
@@ -231,32 +233,24 @@ class LockedLines:
             StorageError: It cannot be created.
         """
         self.path = path
-        try:
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-        except OSError as error:
-            if error.errno == errno.ELOOP:
-                raise InputError(f"{path}: is a link; a run writes inside its own folder only") from None
-            raise _explain(error, path, "nothing was run") from None
-        if not stat.S_ISREG(os.fstat(self._file).st_mode):
-            os.close(self._file)
-            raise InputError(f"{path}: is not a regular file")
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(self._file)
-            raise InputError(f"{path}: another run is writing this journal") from None
-        try:
-            self._size = whole(path)
-            self.torn_bytes = os.fstat(self._file).st_size - self._size
+        with contextlib.ExitStack() as opening:
+            try:
+                file = opening.enter_context(held(path, f"{path}: another run is writing this journal"))
+            except OSError as error:
+                if error.errno == errno.ELOOP:
+                    raise InputError(f"{path}: is a link; a run writes inside its own folder only") from None
+                raise _explain(error, path, "nothing was run") from None
+            if not stat.S_ISREG(os.fstat(file).st_mode):
+                raise InputError(f"{path}: is not a regular file")
+            self._file, self._size = file, whole(path)
+            self.torn_bytes = os.fstat(file).st_size - self._size
             if self.torn_bytes:
-                os.ftruncate(self._file, self._size)
-                os.fsync(self._file)
+                os.ftruncate(file, self._size)
+                os.fsync(file)
             folder = os.open(path.parent, os.O_RDONLY)
             os.fsync(folder)
             os.close(folder)
-        except BaseException:
-            os.close(self._file)
-            raise
+            self._held = opening.pop_all()
 
     def append_line(self, line: bytes, kept: str) -> None:
         """Write one line, its end included, and wait until it is on disk; `kept` says what an error leaves.
@@ -279,9 +273,8 @@ class LockedLines:
 
     def close(self) -> None:
         """Release the file and its lock."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
+        self._held.close()
+        self._file = -1
 
     def __enter__(self) -> Self:
         """Use as a context."""
@@ -320,6 +313,15 @@ class Journal(LockedLines):
         self.append_line(line, f"kept: {counted(kept, 'episode')}")
         self.records.append(linked)
         self._last = line
+
+
+class EpisodeLines(Protocol):
+    """Sink of finished episodes: the journal, or what passes them on to it."""
+
+    records: list[EpisodeRecord]
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Take the record of an episode that ended."""
 
 
 def write_atomic(path: Path, content: str | bytes, kept: str = "the journal is kept") -> None:

@@ -26,12 +26,12 @@ class Shard:
     """One part of a plan."""
 
     number: int
-    """From 1."""
+    """Number of the shard, from 1."""
     count: int
     """Parts of the plan."""
 
     def __str__(self) -> str:
-        """As in --shard: `3/16`."""
+        """Text as in --shard: `3/16`."""
         return f"{self.number}/{self.count}"
 
     def size(self, planned: int) -> int:

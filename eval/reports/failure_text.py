@@ -18,7 +18,7 @@ SENTENCES: dict[str, str] = {
     FailureStage.POSTURE: "it stood where it could touch it and did not, or lost its balance before",
     FailureStage.CONTACT: "it was touched without the wanted effect",
     FailureStage.RECOVERY: "after a touch it fell, or did not follow what had moved away",
-    FailureStage.TRACKING: "its legs did not do what a plausible reference said",
+    FailureStage.TRACKING: "its legs did not follow a plausible reference",
 }
 """Stage → what happened, in a sentence."""
 WAITS = "waits in view"

@@ -43,7 +43,7 @@ FAILURES_FIRST = ("fall", "timeout", "error", "success")
 SHOWN_STRIPS = 12
 """Episodes whose strips are shown; those of the others are folded."""
 SHOWN_SUCCESSES = 3
-"""So many of them are kept for successes."""
+"""Number of them that are kept for successes."""
 LONGEST_ERROR = 300
 """Characters of an episode's error message in the list of episodes."""
 TICKS = (0, 25, 50, 75, 100)
@@ -134,7 +134,7 @@ def _facts(document: Document, results: Results) -> list[tuple[str, str]]:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], cells: int) -> dict[str, object]:
-    """The table; names that are the same in every row are said once, above it."""
+    """The table; names that are the same in every row are shown once, above it."""
     same = {i for i in (1, 2, 3) if len({row[i] for row in rows}) == 1}
     kept = [i for i in range(len(head)) if i not in same]
 

@@ -16,7 +16,7 @@ from arena_newton.robot.g1 import TICK
 __all__ = ["Progress", "duration", "kernels_to_compile", "simulated"]
 
 LINE_SECONDS = 30.0
-"""In a log file a line appears at least so often while ticks go on [s]."""
+"""Longest time between two lines in a log file while ticks go on [s]."""
 LINE_FRACTION = 0.1
 """A line appears also when so much more of the budget is done, if that took a while."""
 LINE_PAUSE = 5.0

@@ -135,8 +135,8 @@ def _markdown(run: RunRecord, results: Results) -> str:
     lines += ["", table(results)]
     lines += [
         "SR is the success rate, ± the population standard deviation over group seeds (suite rows: over all task and",
-        "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start happened while the",
-        "tracker settled.",
+        "seed rates pooled); the interval is Wilson's; AFR is falls per episode; falls at start are those",
+        "of the start-up.",
         "",
     ]
     lines += failures_markdown(results.get("failures", []))

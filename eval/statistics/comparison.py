@@ -63,7 +63,7 @@ class PairComparison:
     second: int
     strata: tuple[StratumPair, ...]
     p: float
-    """Of the stratified exact test."""
+    """Probability of the stratified exact test."""
     p_holm: float
     """Adjusted for the number of pairs."""
     excess: float
@@ -72,7 +72,7 @@ class PairComparison:
 
     @property
     def differs(self) -> bool:
-        """True if the contenders are told apart over all strata."""
+        """True if the contenders differ significantly over all strata."""
         return self.p_holm <= LEVEL
 
 
@@ -86,7 +86,7 @@ class Standing:
     """95 % Wilson interval of the rate, as `high`."""
     high: float
     letters: str
-    """Contenders that share a letter are not told apart."""
+    """Contenders that share a letter do not differ significantly."""
 
     @property
     def rate(self) -> float:
@@ -104,9 +104,9 @@ class Comparison:
     left_out: tuple[Stratum, ...]
     """Those that some contender lacks."""
     overall: tuple[Standing, ...]
-    """Of each contender over all strata."""
+    """Standing of each contender over all strata."""
     within: Mapping[Stratum, tuple[Standing, ...]]
-    """Of each contender in each stratum."""
+    """Standing of each contender in each stratum."""
     pairs: tuple[PairComparison, ...]
 
 

@@ -12,11 +12,11 @@ from arena_newton.files.text import counted
 __all__ = ["MOST_PAIRS", "POWER", "detectable_difference", "detectable_text", "paired_power"]
 
 LEVEL = 0.05
-"""Of the two-sided test."""
+"""Level of the two-sided test."""
 POWER = 0.8
 """Probability with which a difference of the printed size is found."""
 STEP = 0.005
-"""To which the difference is found; it is rounded up."""
+"""Precision of the difference, which is rounded up."""
 MOST_PAIRS = 2000
 """Episodes up to which a plan's difference is computed: a quarter of a second."""
 NEGLIGIBLE = 1e-12

@@ -143,7 +143,7 @@ def outside_suites(names: Iterable[str]) -> list[str]:
 
 
 def error_reasons(records: Iterable[EpisodeRecord]) -> list[ErrorReason]:
-    """Why episodes ended as errors, the most frequent cause first."""
+    """Causes of episodes that ended as errors, the most frequent first."""
     counts: Counter[tuple[str, str]] = Counter(
         (plain_text(record.reason or "error", 80), plain_text(record.error or "no message", 400))
         for record in records
@@ -304,7 +304,7 @@ class Contrast:
     low: float
     high: float
     middle: float
-    """Of the interval: the sum with pseudo-episodes."""
+    """Middle of the interval: the sum with pseudo-episodes."""
     error: float
     """Standard error."""
     strata: int

@@ -50,7 +50,7 @@ class Separation:
     """Separability of two sources by a linear classifier, over episodes that it was not fitted to."""
 
     accuracy: float
-    """Mean over episodes of the fraction of their samples whose source is told; 0.5 is chance."""
+    """Mean over episodes of the fraction of their samples whose source is predicted; 0.5 is chance."""
     low: float
     """95 % interval of the mean over episodes."""
     high: float
@@ -170,7 +170,9 @@ def _panel(axes: Axes, one: ActionMap) -> None:
         axes.scatter([], [], s=14, color=colours[one.names[k]], label=f"observations of {one.names[k]}")
     shades = [colours[one.names[k]] for k in one.sources[order]]
     axes.scatter(one.points[order, 0], one.points[order, 1], s=5, c=shades, alpha=0.55, linewidths=0)
-    title = f"told apart: actions {100 * one.actions.accuracy:.0f} %, states {100 * one.observations.accuracy:.0f} %"
+    title = (
+        f"source predicted: actions {100 * one.actions.accuracy:.0f} %, states {100 * one.observations.accuracy:.0f} %"
+    )
     axes.set_title(f"{one.task}\n{title}", fontsize=9, loc="left")
     axes.set_xticks([])
     axes.set_yticks([])

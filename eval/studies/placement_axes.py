@@ -34,7 +34,7 @@ class Axis:
 
     @property
     def name(self) -> str:
-        """As it is written on the command line and in files."""
+        """Name on the command line and in files."""
         return f"{self.record}.{self.key}"
 
     @property

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 import math
 import re
@@ -22,6 +20,7 @@ from arena_newton.eval.studies.placed_play import PlacedEpisode, PlacedWorlds
 from arena_newton.eval.studies.placement_axes import Axis
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.interfaces import EpisodeResult
+from arena_newton.pages.tables import csv_lines
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["PlacedStudy", "PointTally", "point_rows", "rate_text", "study_folder", "summary_json", "tallies"]
@@ -141,13 +140,11 @@ class _PlacedRows:
             self._file.close()
             self._file = None
         ordered = sorted(self._results, key=lambda one: (one.episode.point, one.episode.episode.index))
-        whole = io.StringIO()
-        csv.writer(whole, lineterminator="\n").writerows([self._head(), *(self._row(one) for one in ordered)])
-        write_atomic(self._path, whole.getvalue())
+        write_atomic(self._path, csv_lines([self._head(), *map(self._row, ordered)]))
 
     def _put(self, file: TextIO, rows: Sequence[Sequence[object]]) -> None:
         try:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+            file.write(csv_lines(rows))
             file.flush()
         except OSError as error:
             raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
@@ -218,11 +215,9 @@ def _number(value: float) -> str:
 def point_rows(axes: Sequence[Axis], points: Sequence[PointTally]) -> str:
     """CSV with one row per placement."""
     columns = ("episodes", "successes", "falls", "errors", "success_rate", "mean_margin", "least_margin", "success_s")
-    whole = io.StringIO()
-    writer = csv.writer(whole, lineterminator="\n")
-    writer.writerow([*(axis.name for axis in axes), *columns])
+    rows = []
     for one in points:
         counts = (one.episodes, one.successes, one.falls, one.errors)
         measured = (one.rate, one.mean_margin, one.least_margin, one.success_s)
-        writer.writerow([*map(_number, one.values), *counts, *map(_number, measured)])
-    return whole.getvalue()
+        rows.append((*map(_number, one.values), *counts, *map(_number, measured)))
+    return csv_lines([(*(axis.name for axis in axes), *columns), *rows])

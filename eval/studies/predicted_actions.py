@@ -170,11 +170,13 @@ def predict(
         seed: Chooses the episode seeds that the policy is given.
 
     Raises:
-        InputError: The pictures do not fit, or the policy needs a world or gives no usable action.
+        InputError: The pictures do not fit, or the policy needs depth or a world, or gives no usable action.
     """
     spec = tasks.get(samples.task)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     cameras = policy_cameras(policy)
+    if deep := [name for name, camera in cameras.items() if camera.depth]:
+        raise InputError(f"policy {policy.name}: observes the depth of {' '.join(deep)}, which datasets do not hold")
     found = np.zeros((len(samples), ACTION_WIDTH), dtype=np.float32)
     for first in range(0, len(samples), batch):
         some = np.arange(first, min(first + batch, len(samples)))

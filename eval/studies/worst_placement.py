@@ -62,7 +62,7 @@ class CrossEntropy:
 
     axes: tuple[Axis, ...]
     mean: np.ndarray
-    """Of each axis, as a part of its range from 0 to 1."""
+    """Mean of each axis, as a part of its range from 0 to 1."""
     spread: np.ndarray
     """Standard deviation of each axis, as a part of its range."""
     rng: np.random.Generator

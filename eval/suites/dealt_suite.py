@@ -1,7 +1,8 @@
 """``eval matrix --jobs`` and ``--ray``: one pool of processes plays the cells of a suite, several at once.
 
-A cell is begun when a process has opened it, and is an ordinary results folder with a journal of its own, as `dealing`
-writes it. Processes keep their environment from cell to cell where the next one asks for the same.
+A cell, with those that play in one batch of worlds with it, is begun when a process has opened it, and is an ordinary
+results folder with a journal of its own, as `dealing` writes it. Processes keep their environment from cell to cell
+where the next one asks for the same.
 """
 
 from __future__ import annotations
@@ -11,11 +12,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from arena_newton import rule_sets, tasks
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.play.run import Factories
-from arena_newton.eval.play.run_flow import Group, begun, reported
-from arena_newton.eval.records.journal import Journal, StorageError
+from arena_newton.eval.play.run_flow import begun, reported
+from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.suites.suite_call import SuiteCall
 from arena_newton.eval.suites.suite_folder import SuiteFolder
@@ -50,16 +50,17 @@ def run(call: SuiteCall, factories: Factories | None = None) -> int:
 
 @dataclass(eq=False)
 class _Cell:
-    """A cell of this call."""
+    """A cell of this call, or several that play in one batch of worlds."""
 
-    name: str
+    names: tuple[str, ...]
     number: int
     """Its position among those to play."""
-    group: Group
-    scene: str
-    """Name of its task's scene in its mode."""
+    env: tuple[str, str, str]
+    """Task, tracker and scene of its environment."""
     episodes: int
     """Not yet in its journal."""
+    ticks: int
+    """Their step budgets [ticks]."""
     job: Job
     opening: bool = False
     """True if a process opens it that has not been opened before."""
@@ -68,7 +69,7 @@ class _Cell:
     held: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """Journal and status, while it is played."""
     error: ArenaError | None = None
-    """Why no more of it is dealt out."""
+    """Error after which no more of it is dealt out."""
     ended: bool = False
 
     @property
@@ -82,17 +83,17 @@ class _Cell:
 class _PoolPlayer(CellPlayer):
     """Plays cells by a pool."""
 
-    def play_cells(self, todo: Sequence[str]) -> bool:
+    def play_cells(self, todo: Sequence[tuple[str, ...]]) -> bool:
         """Play cells that were checked; False when it was interrupted."""
         if not todo:
             return True
-        self.cells = [self._cell(name, number) for number, name in enumerate(todo)]
+        self.cells = [self._cell(names, number) for number, names in enumerate(todo)]
         self.jobs = {cell.job: cell for cell in self.cells}
-        planned, ticks = sum(cell.episodes for cell in self.cells), sum(map(self._ticks_left, self.cells))
-        self.shown = Progress(ticks, planned=planned)
+        planned = sum(cell.episodes for cell in self.cells)
+        self.shown = Progress(sum(cell.ticks for cell in self.cells), planned=planned)
         self.done = 0
         self.played_ticks, self.began = 0.0, time.monotonic()
-        with backend_of(self.options, self.configs[todo[0]].device) as backend, contextlib.ExitStack() as ended:
+        with backend_of(self.options, self.configs[todo[0][0]].device) as backend, contextlib.ExitStack() as ended:
             self.pool = WorkerPool(backend, planned, self.given)
             self.pool.shown = self.shown
             self.shown.group(f"{len(self.pool.workers)} processes")
@@ -112,15 +113,12 @@ class _PoolPlayer(CellPlayer):
         """Time that cells with step budgets of so many ticks take, at the speed so far of all processes [s]."""
         return ticks * (time.monotonic() - self.began) / max(self.played_ticks, 1.0)
 
-    def _cell(self, name: str, number: int) -> _Cell:
-        cell, results = self.folder.plan.cell(name), self.results(name)
-        left = cell.episodes - self.folder.counts(name)["finished"]
-        scene = tasks.get(cell.task).scene_name(cell.mode, rule_sets.get(cell.rules))
-        return _Cell(name, number, (cell.task, cell.tracker, cell.mode), scene, max(left, 1), Job(results))
-
-    def _ticks_left(self, cell: _Cell) -> int:
-        whole = self.folder.plan.cell(cell.name)
-        return round(whole.ticks * cell.episodes / whole.episodes)
+    def _cell(self, names: tuple[str, ...], number: int) -> _Cell:
+        cells = [self.folder.plan.cell(name) for name in names]
+        left = [max(cell.episodes - self.folder.counts(cell.id)["finished"], 1) for cell in cells]
+        ticks = sum(cell.ticks * few // cell.episodes for cell, few in zip(cells, left, strict=True))
+        env = cells[0].task, cells[0].tracker, self.scene(names[0])
+        return _Cell(names, number, env, sum(left), ticks, Job(self.results_of(names)))
 
     def _play(self) -> None:
         """Play until nothing is left."""
@@ -135,8 +133,8 @@ class _PoolPlayer(CellPlayer):
 
     def _give(self, worker: Worker) -> None:
         """Give work to a process that waits: a batch of the run that it has open, or another run to open."""
-        busy = {one.assignment.group for one in self.pool.workers if one.assignment is not None}
-        there = {(*cell.group[:2], cell.scene) for cell in self.cells if cell.group == worker.last}
+        busy = {self.jobs[one.assignment.job].env for one in self.pool.workers if one.assignment is not None}
+        there = None if worker.job is None else self.jobs[worker.job].env
 
         def wanted(cell: _Cell) -> bool:
             if not cell.open or cell.dealt is None or cell.job is worker.job:
@@ -144,10 +142,8 @@ class _PoolPlayer(CellPlayer):
             coming = [one for one in self.pool.workers if one.job is cell.job and one.assignment is None]
             return len(coming) < cell.dealt.batches  # no more open it than find something to play
 
-        def order(cell: _Cell) -> tuple[bool, bool, bool, bool, bool, int]:
-            fresh, elsewhere = cell.dealt is None, (*cell.group[:2], cell.scene) not in there
-            last = cell.job is not worker.job, cell.group != worker.last, elsewhere
-            return *last, fresh, cell.group in busy, cell.number
+        def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int]:
+            return cell.job is not worker.job, cell.env != there, cell.dealt is None, cell.env in busy, cell.number
 
         found = min(filter(wanted, self.cells), key=order, default=None)
         if found is None:
@@ -180,14 +176,10 @@ class _PoolPlayer(CellPlayer):
         """Begin a cell that a process has opened."""
         folder, config = cell.job.folder, cell.job.configured()
         assert cell.job.opened is not None
-        self.begun(cell.name, cell.job.opened.device)
-        folder.make()
+        self.begun(cell.names, cell.job.opened.device)
         with self.silence():
-            journal = cell.held.enter_context(Journal(folder.journal))
-            folder.prepare(config, journal.records)
-            folder.sweep()
-            cell.held.callback(folder.sweep)
-            done, waiting = begun(config, folder, journal)
+            journal = cell.held.enter_context(folder.opened(config))
+            done, waiting = begun(config, folder, journal.records)
             if waiting:
                 cell.held.enter_context(folder.running())
             cell.dealt = DealtRun(cell.job, journal, self.pool, done, waiting, self.shown, lambda: self._besides(cell))
@@ -210,17 +202,17 @@ class _PoolPlayer(CellPlayer):
             self._close(cell, cell.error)
             if cell.error is None:
                 with self.silence():
-                    code = reported(cell.job.folder, cell.job.seconds)
+                    code = max(reported(part, cell.job.seconds) for part in cell.job.folder.parts)
         except StorageError:
             raise
         except ArenaError as error:
             cell.error = cell.error or error
         self.done += 1
         if cell.error is None:
-            self.played_ticks += self._ticks_left(cell)
-        print(f"[{self.done}/{len(self.cells)}] {cell.name}", flush=True)
-        left = [one.name for one in self.cells if not one.ended]
-        self.ended(cell.name, code, cell.error, cell.job.seconds, left)
+            self.played_ticks += cell.ticks
+        print(f"[{self.done}/{len(self.cells)}] {self.shown_names(cell.names)}", flush=True)
+        left = [name for one in self.cells if not one.ended for name in one.names]
+        self.ended(cell.names, code, cell.error, cell.job.seconds, left)
 
     def _close(self, cell: _Cell, error: BaseException | None) -> None:
         """Let go of the journal; the folder's status says how the run ended."""
@@ -235,4 +227,4 @@ class _PoolPlayer(CellPlayer):
                 cell.ended = True
                 with contextlib.suppress(InputError, StorageError):
                     self._close(cell, stop)
-                    self.ended(cell.name, 130, None, cell.job.seconds, ())
+                    self.ended(cell.names, 130, None, cell.job.seconds, ())

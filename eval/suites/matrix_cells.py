@@ -1,6 +1,6 @@
 """The cells of a suite file: expanded, chosen, dealt to shards, shown. Nothing is built and nothing runs.
 
-Cells of one task, tracker, mode and rule set follow each other, so that they can use one environment.
+Cells of one task, tracker and rule set follow each other, mode by mode, so that they can use one environment.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class SuiteCall:
     again: str
     """The command that continues it."""
     problem: InputError | None = None
-    """Why a dry run's cells could not be played."""
+    """Error for which a dry run's cells could not be played."""
 
     def table(self) -> str:
         """The matrix of the chosen cells, with what is done of it."""

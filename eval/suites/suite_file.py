@@ -19,6 +19,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.schema import MAX_COUNT
 from arena_newton.files.stored_json import MAX_TEXT, Json, JsonObject, check_types, shown
 from arena_newton.files.text import is_printable, plain_text
+from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.rules.rule_types import MODES, check_name
 from arena_newton.trackers import check_spec
 
@@ -52,11 +53,9 @@ TABLES = ("name", "defaults", "matrix", "checkpoints", "policies", "cells")
 LISTS = ("tasks", "trackers", "modes", "rules", "latency", "trained_on", "trained_tasks", "seeds")
 """Keys whose single value may be given without brackets."""
 SELECTORS = ("policy", "family", "trained_on", "tracker", "task", "mode", "rules", "labels", "latency", "matched")
-"""By what cells are chosen, in [[cells]] and in --only."""
+"""Keys by which cells are chosen, in [[cells]] and in --only."""
 PATTERNS = ("task", "tracker")
 """Names in braces that a policy's spec may hold."""
-LABELS = ("v3.1", "v4")
-"""Label protocols, `data.readers.label_protocols.LABELS`, which loads torch."""
 MAX_LATENCY = 1000
 """Most ticks by which a chunk may start late; 20 s, beyond every chunk."""
 
@@ -87,7 +86,7 @@ class PolicyEntry:
     spec: str = ""
     """Value of --policy; `{task}` and `{tracker}` stand for task and tracker of its training."""
     family: str = ""
-    """Such as `act`; a checkpoint of ours says it itself."""
+    """Family of the policy, such as `act`; a checkpoint of ours names it itself."""
     trained_on: tuple[str, ...] = ()
     """Trackers of its demonstrations: with `{tracker}` in the spec one checkpoint for each, else one of all."""
     trained_tasks: tuple[str, ...] = ()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
-import fcntl
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
@@ -33,6 +31,7 @@ from arena_newton.eval.suites.suite_records import (
     suite_json,
     with_events,
 )
+from arena_newton.files.new_folder import held
 
 __all__ = ["LOCK_FILE", "REPLACED", "SuiteFolder"]
 
@@ -78,24 +77,18 @@ class SuiteFolder:
         if foreign and not (self.path / SUITE_FILE).exists():
             raise InputError(f"--out {self.path}: is not empty and holds no suite; choose another folder")
         before = read_suite(self.path) if (self.path / SUITE_FILE).exists() else None
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock = os.open(self.path / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise InputError(f"--out {self.path}: cannot be written ({error.strerror})") from None
-        try:
-            kind = fcntl.LOCK_EX if self.shards == 1 else fcntl.LOCK_SH
+        with contextlib.ExitStack() as stack:
             try:
-                fcntl.flock(lock, kind | fcntl.LOCK_NB)
-            except OSError:
-                raise InputError(f"{self.path}: another process plays this suite") from None
-            self._check_other_shards()
+                self.path.mkdir(parents=True, exist_ok=True)
+                taken = f"{self.path}: another process plays this suite"
+                stack.enter_context(held(self.path / LOCK_FILE, taken, shared=self.shards > 1))
+                self._check_other_shards()
+            except OSError as error:
+                raise InputError(f"--out {self.path}: cannot be written ({error.strerror})") from None
             journal = self.path / journal_file(self.shard, self.shards)
-            with LockedLines(journal, lambda path: read_journal_events(path)[1]) as self._journal:
-                self._take_over(cells, before)
-                yield
-        finally:
-            os.close(lock)
+            self._journal = stack.enter_context(LockedLines(journal, lambda path: read_journal_events(path)[1]))
+            self._take_over(cells, before)
+            yield
 
     def _check_other_shards(self) -> None:
         """Refuse to play next to shards of another number: both would play the same cells."""
@@ -103,11 +96,8 @@ class SuiteFolder:
             name = JOURNAL_PATTERN.fullmatch(path.name)
             if name is None or int(name[2]) == self.shards or path.is_symlink():
                 continue
-            with path.open("rb") as file:
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except OSError:
-                    raise InputError(f"{self.path}: is being played as shard {name[1]}/{name[2]}") from None
+            with held(path, f"{self.path}: is being played as shard {name[1]}/{name[2]}"):
+                pass
 
     def _take_over(self, cells: Sequence[SuiteCell], before: SuitePlan | None) -> None:
         """Take the plan, what is known of its cells, and close what an earlier call of this shard left open."""
@@ -134,16 +124,12 @@ class SuiteFolder:
 
     def save(self) -> None:
         """Write `suite.json` with what all journals say; other shards wait meanwhile."""
-        folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX)
+        with held(self.path, wait=True):
             if (self.path / SUITE_FILE).exists():
                 stored = {cell.id: cell for cell in read_suite(self.path).cells}
                 self.plan = dataclasses.replace(self.plan, cells=tuple(_knowing(self.plan.cells, stored)))
             self._refresh()
             write_atomic(self.path / SUITE_FILE, json.dumps(suite_json(self.plan), indent=1) + "\n")
-        finally:
-            os.close(folder)
 
     def configured(self, hashes: Mapping[str, str]) -> None:
         """Keep the configuration hashes of the cells that were checked, and write `suite.json`."""

@@ -36,7 +36,7 @@ class _Cells:
     retry_errors: bool = False
     """Run episodes again that ended with an error."""
     device: str | None = None
-    """Device of all cells instead of the suite's: cpu, cuda, cuda:1."""
+    """Device of all cells, as of `run`, instead of the suite's."""
 
 
 @dataclass(frozen=True)

@@ -103,15 +103,15 @@ class SuiteCell:
     finished: Count = 0
     """Episodes in its journal when it last began or ended."""
     successes: Count = 0
-    """Of them successes."""
+    """Number of them that succeeded."""
     errors: Count = 0
-    """Of them episodes that ended as errors."""
+    """Number of them that ended as errors."""
     wall_s: Seconds = 0.0
     """Time that it took, attempts that were broken off included [s]."""
     device: Text = ""
     """Device on which it was played, such as `NVIDIA H200` or `cpu`."""
     error: Annotated[str | None, Fit("text or null")] = None
-    """Why it is `failed`."""
+    """Error of a cell that is `failed`."""
 
     @property
     def matched(self) -> bool | None:
@@ -174,7 +174,7 @@ class SuitePlan:
     hash: str
     """Hash of its content."""
     cells: tuple[SuiteCell, ...]
-    """In the order of the plan, with what the journals say."""
+    """Cells in the order of the plan, with what the journals say."""
 
     def cell(self, name: str) -> SuiteCell:
         """A cell by its id.

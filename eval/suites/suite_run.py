@@ -1,4 +1,7 @@
-"""Play a suite: check all its cells, then run what is missing cell by cell, each as an ordinary results folder."""
+"""Play a suite: check all its cells, then run what is missing, each cell as an ordinary results folder.
+
+Cells that differ in their mode alone play in one batch of worlds where their modes have one scene.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,11 @@ import io
 import time
 from collections.abc import Iterator, Sequence
 
-from arena_newton import doctor
+from arena_newton import doctor, rule_sets, tasks
 from arena_newton.cli.flags import shell_command
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.eval.folders.joined_folders import JoinedFolders
 from arena_newton.eval.folders.run_folder import ResultsFolder, setting, timestamp
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.options import Workers, flags_of
@@ -59,7 +63,7 @@ def run(call: SuiteCall, factories: Factories | None = None) -> int:
 
 
 class CellPlayer:
-    """One call: what all its cells share. It plays one cell after the other."""
+    """One call: what all its cells share. It plays one batch of cells after the other."""
 
     def __init__(
         self, suite: SuiteFile, folder: SuiteFolder, options: MatrixOptions, factories: Factories | None, *, again: str
@@ -85,7 +89,7 @@ class CellPlayer:
             todo = todo[: self.options.limit]
         self._measure_before(cells)
         try:
-            whole = self.play_cells(todo)
+            whole = self.play_cells(self._joined(todo))
         except KeyboardInterrupt:  # as a cell begins or ends
             whole = False
         if not whole:
@@ -93,10 +97,24 @@ class CellPlayer:
             return 130
         return self._end(chosen)
 
-    def play_cells(self, todo: Sequence[str]) -> bool:
-        """Play cells that were checked; False when it was interrupted."""
+    def _joined(self, todo: Sequence[str]) -> list[tuple[str, ...]]:
+        """Cells by what plays at once: those that differ in their mode alone, where their modes have one scene."""
+        found: dict[object, tuple[str, ...]] = {}
+        for name in todo:
+            cell, flags = self.folder.plan.cell(name), dataclasses.replace(self.configs[name].flags, mode=(), out=None)
+            alike = cell.policy, cell.trained_on, flags, self.scene(name)
+            found[alike] = (*found.get(alike, ()), name)
+        return list(found.values())
+
+    def scene(self, name: str) -> str:
+        """Name of the scene of a cell's task in its mode."""
+        cell = self.folder.plan.cell(name)
+        return tasks.get(cell.task).scene_name(cell.mode, rule_sets.get(cell.rules))
+
+    def play_cells(self, todo: Sequence[tuple[str, ...]]) -> bool:
+        """Play cells that were checked, each tuple of them at once; False when it was interrupted."""
         try:
-            return all(self._play_cell(name, number, todo) for number, name in enumerate(todo))
+            return all(self._play_joined(names, number, todo) for number, names in enumerate(todo))
         finally:
             self.env_cache.drop()
 
@@ -139,6 +157,11 @@ class CellPlayer:
     def results(self, name: str) -> ResultsFolder:
         """Results folder of a cell that was checked."""
         return ResultsFolder(self.folder.cell_path(name), self.configs[name], self.installed)
+
+    def results_of(self, names: Sequence[str]) -> ResultsFolder:
+        """Results folder of cells that are played at once."""
+        parts = [self.results(name) for name in names]
+        return parts[0] if len(parts) == 1 else JoinedFolders(parts)
 
     def _check_parts(self, chosen: Sequence[str]) -> None:
         """Make each tracker, and each policy that is made quickly, once."""
@@ -221,15 +244,15 @@ class CellPlayer:
             if cell.status == "done" and cell.wall_s > 0:
                 self.spent, self.done_ticks = self.spent + cell.wall_s, self.done_ticks + cell.ticks
 
-    def _play_cell(self, name: str, number: int, todo: Sequence[str]) -> bool:
-        """Play one cell; False when it was interrupted."""
-        print(f"[{number + 1}/{len(todo)}] {name}", flush=True)
-        self.begun(name, device_name(self.configs[name].device))
+    def _play_joined(self, names: tuple[str, ...], number: int, todo: Sequence[tuple[str, ...]]) -> bool:
+        """Play cells at once; False when it was interrupted."""
+        print(f"[{number + 1}/{len(todo)}] {self.shown_names(names)}", flush=True)
+        self.begun(names, device_name(self.configs[names[0]].device))
         began = time.perf_counter()
         error: Exception | None = None
         try:
             with self.silence():
-                code = execute(self.results(name), self.factories)
+                code = execute(self.results_of(names), self.factories)
         except KeyboardInterrupt:
             code = 130
         except StorageError:
@@ -239,54 +262,62 @@ class CellPlayer:
         wall = time.perf_counter() - began
         if code:
             self.env_cache.drop()  # what broke off in it may have left it in any state
-        return self.ended(name, code, error, wall, todo[number + 1 :])
+        return self.ended(names, code, error, wall, [name for later in todo[number + 1 :] for name in later])
+
+    def shown_names(self, names: Sequence[str]) -> str:
+        """Cells that are played at once, in a line: the first, then the modes of the others."""
+        return " ".join([names[0], *(self.folder.plan.cell(name).mode for name in names[1:])])
 
     def silence(self) -> contextlib.AbstractContextManager[object]:
         """Context that hides the output of a run unless --verbose shows it."""
         return contextlib.nullcontext() if self.options.verbose else contextlib.redirect_stdout(io.StringIO())
 
-    def begun(self, name: str, device: str) -> None:
-        """Journal that a cell begins on a device."""
-        self.devices[name] = device
-        self.folder.add(
-            CellEvent(cell=name, event="begun", at=timestamp(), config=self.configs[name].hash, device=device)
-        )
+    def begun(self, names: Sequence[str], device: str) -> None:
+        """Journal that cells begin on a device."""
+        for name in names:
+            self.devices[name] = device
+            self.folder.add(
+                CellEvent(cell=name, event="begun", at=timestamp(), config=self.configs[name].hash, device=device)
+            )
 
-    def ended(self, name: str, code: int, error: Exception | None, wall: float, left: Sequence[str]) -> bool:
-        """Journal and say how a cell ended.
+    def ended(self, names: Sequence[str], code: int, error: Exception | None, wall: float, left: Sequence[str]) -> bool:
+        """Journal and say how cells ended that were played at once.
 
         Args:
-            name: The cell.
-            code: Exit code of its run; 130 when it was interrupted.
-            error: Why it could not be played.
-            wall: Time that it took [s].
-            left: Cells that are to be played after it.
+            names: The cells.
+            code: Exit code of their run; 130 when it was interrupted.
+            error: Why they could not be played.
+            wall: Time that they took [s].
+            left: Cells that are to be played after them.
 
         Returns:
             False when it was interrupted.
 
         Raises:
-            RunStopped: It could not be played, and --keep-going was not given.
+            RunStopped: They could not be played, and --keep-going was not given.
         """
-        cell = self.folder.plan.cell(name)
-        if error is None and code != 130 and self.folder.counts(name)["finished"] < cell.episodes:
-            error = RunStopped(f"ended before all of {counted(cell.episodes, 'episode')} were played")
-        found = self._journalled(name, code, error, wall)
+        planned = self.folder.plan.cell(names[0]).episodes
+        if error is None and code != 130 and any(self.folder.counts(name)["finished"] < planned for name in names):
+            error = RunStopped(f"ended before all of {counted(planned, 'episode')} were played")
+        wall /= len(names)
+        found = [self._journalled(name, code, error, wall) for name in names]
         if error is not None:
             message = plain_text(f"{error}", 400) or type(error).__name__
             if not self.options.keep_going:
                 if not isinstance(error, ArenaError):
                     raise error
                 raise RunStopped(
-                    f"cell {name}: {message}; continue with: {self.again} (--keep-going passes cells that fail)"
+                    f"cell {self.shown_names(names)}: {message}; continue with: {self.again} (--keep-going passes "
+                    "cells that fail)"
                 ) from None
-            self.failed.append((name, message))
+            self.failed += [(name, message) for name in names]
             print(f"  failed: {message}", flush=True)
             return True
         if code == 130:
             return False
-        self.spent, self.done_ticks = self.spent + wall, self.done_ticks + cell.ticks
-        print(f"  {self._line(found, wall, left)}", flush=True)
+        for cell in found:
+            self.spent, self.done_ticks = self.spent + wall, self.done_ticks + cell.ticks
+            print(f"  {self._line(cell, wall, left)}", flush=True)
         return True
 
     def _journalled(self, name: str, code: int, error: Exception | None, wall: float) -> SuiteCell:
@@ -309,7 +340,7 @@ class CellPlayer:
 
     def _line(self, cell: SuiteCell, wall: float, left: Sequence[str]) -> str:
         """Line about a cell that is done, with the time that the others take."""
-        parts = [f"{cell.successes}/{cell.episodes} successes"]
+        parts = [f"{cell.mode}: {cell.successes}/{cell.episodes} successes"]
         parts += [f"{counted(cell.errors, 'error')}"] if cell.errors else []
         parts.append(duration(wall))
         if not left:

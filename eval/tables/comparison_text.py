@@ -32,14 +32,14 @@ OVER_ALL = "all"
 CELLS = ("both", "only_first", "only_second", "neither")
 """Endings of a pair of episodes."""
 LEAST = 1e-300
-"""Probabilities below this are said to be so: they may be too small for a number."""
+"""Probabilities below this are shown as below it: they may be too small for a number."""
 METHOD = (
     "Within a task: McNemar's exact test of the episodes that both played; where two runs share no episode, "
     f"Boschloo's exact test (Fisher's where the product of their numbers is above {LARGEST_BOSCHLOO:,}). Over all "
     "tasks: the exact conditional test of Cochran, Mantel and Haenszel, tasks as strata. All are two-sided. p (Holm) "
     "is adjusted over all pairs, within tasks over all pairs in all tasks.",
-    f"Those that share a letter are not told apart (adjusted p above {LEVEL:g}), which does not say that they are "
-    "alike. The first letters are of the best.",
+    f"Those that share a letter do not differ significantly (adjusted p above {LEVEL:g}), which does not show that "
+    "they are alike. The first letters are of the best.",
     "Rates have 95 % Wilson intervals. Δ is the first rate minus the second in points, over all tasks the mean of the "
     "tasks' differences, with its 95 % interval (Agresti and Min where paired, Agresti and Caffo where not; of several "
     "tasks the pseudo-episodes that move its middle are shared out, after Price and Bonett).",
@@ -76,7 +76,7 @@ def verdict(comparison: Comparison, pair: PairComparison) -> str:
     """Result of a pair's test, in a sentence."""
     first, second = comparison.names[pair.first], comparison.names[pair.second]
     if not pair.differs:
-        return f"{first} and {second} are not told apart"
+        return f"{first} and {second} do not differ significantly"
     better, worse = (first, second) if pair.excess > 0 else (second, first)
     if pair.difference.value == 0.0:
         return f"{better} succeeds in more episodes than {worse}, with equal mean rates"

@@ -49,7 +49,7 @@ class Compared:
 
     name: str
     folder: Path
-    """As it was named on the command line."""
+    """Folder as it was named on the command line."""
     cells: list[PlayedCell] = dataclasses.field(default_factory=list)
     episodes: dict[tuple[Stratum, Hashable], PlayedEpisode] = dataclasses.field(default_factory=dict)
     """Its episodes, by stratum and what names the episode in every folder: group seed, repeat and episode seed."""
@@ -105,7 +105,7 @@ class ContenderSet:
 
     compared: tuple[Compared, ...]
     contenders: tuple[Contender, ...]
-    """Of each its outcomes."""
+    """Contenders with their outcomes."""
     alike: tuple[tuple[str, str], ...]
     """Conditions that all share, by name."""
     notes: tuple[str, ...]
@@ -156,7 +156,7 @@ def read_contenders(
 
 
 def _titles(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the folders' paths by which they can be told apart."""
+    """The shortest ends of the folders' paths by which they differ."""
     paths = [folder.resolve() for folder in folders]
     for number in range(1, max(len(path.parts) for path in paths) + 1):
         names = [plain_text("/".join(path.parts[-number:]), None) for path in paths]

@@ -176,7 +176,7 @@ def _conditions(cells: Sequence[PlayedCell]) -> list[str]:
 
 
 def _named_rows(cells: Sequence[EvaluatedCell]) -> tuple[EvaluatedCell, ...]:
-    """Cells whose `policy` names one row: label protocols and chunk executions that differ are told apart."""
+    """Cells whose `policy` names one row: it names label protocols and chunk executions that differ."""
     parts: dict[str, tuple[set[str], set[object], set[bool]]] = {}
     for cell in cells:
         labels, replans, ensembles = parts.setdefault(cell.recipe, (set(), set(), set()))

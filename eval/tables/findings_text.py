@@ -16,14 +16,14 @@ def findings_text(found: Sequence[ClaimResult], notes: Sequence[str] = ()) -> st
     """The findings as Markdown."""
     parts = ["# The paper's findings, tested on the trainings that were evaluated\n"]
     parts.append(
-        "What these networks say of the paper's claims. Its claims are about families, trackers and modes, so that "
+        "The paper's claims, tested on these networks. They are claims about families, trackers and modes, so that "
         "their unit is a training, not an episode: the 95 % intervals in parentheses cover other trainings of the "
         f"same recipes. {DECLARED}\n"
     )
     parts.append(
-        "Reproduces: the interval is on the claim's side of 0, and of a claim that something differs beyond "
-        f"{100 * NEGLIGIBLE:.0f} points. Does not: it excludes an effect of {100 * NEGLIGIBLE:.0f} points. Undecided: "
-        f"neither, or p is {SIGNIFICANT:g} and above when adjusted for all claims of this page (Holm).\n"
+        "Reproduces: the interval is on the claim's side of 0; where the claim is a difference of either sign, it is "
+        f"beyond {100 * NEGLIGIBLE:.0f} points. Does not: the interval excludes an effect of {100 * NEGLIGIBLE:.0f} "
+        f"points. Undecided: neither, or p, adjusted for all claims of this page (Holm), is at least {SIGNIFICANT:g}.\n"
     )
     parts += ["".join(f"- {escaped(note)}\n" for note in notes)] if notes else []
     for one in found:
@@ -37,11 +37,11 @@ def findings_text(found: Sequence[ClaimResult], notes: Sequence[str] = ()) -> st
 
 
 DECLARED = (
-    f"How much trainings of a recipe differ is read from them where {ENOUGH} or more were evaluated. Elsewhere it is "
-    f"declared, after eight cells of three trainings: a standard deviation of {100 * MATCHED_SPREAD:.0f} points of a "
-    f"rate through the tracker of the training, of {100 * SWAPPED_SPREAD:.0f} through another, and of "
-    f"{100 * DROP_SPREAD:.0f} of a difference between trackers or modes; for falls the spread over the cells compared "
-    "stands for it."
+    "The standard deviation between trainings of a recipe is measured where "
+    f"{ENOUGH} or more were evaluated. Elsewhere it is declared, after eight cells of three trainings: "
+    f"{100 * MATCHED_SPREAD:.0f} points for a rate through the tracker of the training, {100 * SWAPPED_SPREAD:.0f} "
+    f"through another, and {100 * DROP_SPREAD:.0f} for a difference between trackers or modes; for falls it is that "
+    "between the cells compared."
 )
 
 

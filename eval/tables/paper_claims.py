@@ -46,7 +46,7 @@ class ClaimResult:
 
     name: str
     claim: str
-    """In the paper's sense, in our words."""
+    """Claim in the paper's sense, in our words."""
     paper: str
     """Its numbers."""
     ours: str
@@ -55,7 +55,7 @@ class ClaimResult:
     remark: str = ""
     """Sentences to read with the statistic."""
     p: float | None = None
-    """Of the test that the verdict is from, two-sided; None where nothing was tested."""
+    """Probability of the test behind the verdict, two-sided; None where nothing was tested."""
     p_holm: float | None = None
     """Adjusted for the number of claims that were tested."""
 
@@ -79,7 +79,7 @@ def _described(found: TrainedContrast | None, of: str) -> str:
 
 
 def _greater(found: TrainedContrast | None) -> Test:
-    """Of a claim that a difference is positive."""
+    """Test of a claim that a difference is positive."""
     if found is None:
         return UNTESTED
     above = found.p(0.0) if found.middle > 0 else 1.0
@@ -88,7 +88,7 @@ def _greater(found: TrainedContrast | None) -> Test:
 
 
 def _different(found: TrainedContrast | None, negligible: float = NEGLIGIBLE) -> Test:
-    """Of a claim that a difference is not zero: beyond what is negligible, or within it."""
+    """Test of a claim that a difference is not zero: beyond what is negligible, or within it."""
     if found is None:
         return UNTESTED
     if abs(found.middle) >= NEGLIGIBLE:
@@ -127,12 +127,12 @@ class _Cells:
         self.single = [cell for cell in learned if not cell.merged]
         self.merged = [cell for cell in learned if cell.merged]
         self.matched: dict[tuple[str, str, str, str], list[EvaluatedCell]] = {}
-        """By mode, tracker, recipe, task."""
+        """Cells by mode, tracker, recipe, task."""
         for c in self.single:
             if c.matched:
                 self.matched.setdefault((c.mode, c.tracker, c.recipe, c.task), []).append(c)
         self.families = {cell.recipe: cell.family or cell.recipe for cell in self.single}
-        """By recipe."""
+        """Families by recipe."""
 
     def recipes(self, mode: str, tracker: str) -> list[str]:
         """Recipes with matched cells."""
@@ -243,7 +243,7 @@ class _Compared:
 
 
 def _common(cells: _Cells, trackers: Sequence[str], among: Sequence[str]) -> _Compared | None:
-    """As many families as share a task, on as many tasks as these share; rather more families than more tasks."""
+    """Largest set of families that share tasks, with these tasks; rather more families than more tasks."""
     played = {}
     for recipe in sorted(set().union(*(cells.recipes("base", t) for t in trackers))):
         played[recipe] = set.intersection(*(cells.tasks("base", t, recipe) for t in trackers)) & set(among)

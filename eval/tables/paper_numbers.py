@@ -110,11 +110,11 @@ class PaperNumbers:
     """All numbers of the paper's tables."""
 
     in_gmt: Mapping[tuple[str, str, str, str], PaperRate]
-    """By tracker, mode, family and task or average."""
+    """Rates by tracker, mode, family and task or average."""
     cross_gmt: Mapping[tuple[str, str, str, str], PaperTransfer]
-    """By tracker of training, tracker of execution, family and task."""
+    """Transfers by tracker of training, tracker of execution, family and task."""
     merged: Mapping[tuple[str, str, str], PaperRate]
-    """By training set, family and task or average."""
+    """Rates by training set, family and task or average."""
 
     def best(self, tracker: str, task: str, mode: str = "base") -> PaperRate:
         """The family with the highest rate."""
@@ -275,7 +275,7 @@ class PublishedRow:
     """Source of the numbers, with the date."""
     simulator: str
     rates: Mapping[str, float]
-    """By task, from 0 to 1."""
+    """Rates by task, from 0 to 1."""
 
     def __str__(self) -> str:
         return f"{self.policy} by its authors ({self.source}) in {self.simulator}"

@@ -83,7 +83,7 @@ def _check_unique(found: Sequence[tuple[str, EvaluatedCell]]) -> None:
 
 
 def _cell(held: Sequence[bool]) -> str:
-    """Such as `58/60 (89 to 99)`; empty without episodes."""
+    """Text such as `58/60 (89 to 99)`; empty without episodes."""
     interval = wilson(sum(held), len(held))
     return "" if interval is None else f"{sum(held)}/{len(held)} ({between(interval)})"
 

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 __all__ = ["COLOURS", "save", "write"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")
-"""Okabe and Ito's colours, told apart by colour-blind readers too."""
+"""Okabe and Ito's colours, which colour-blind readers distinguish too."""
 DPI = 110
-"""Of the files [1/inch]."""
+"""Resolution of the files [1/inch]."""
 HALVES = ("HOI_AVG", "HSI_AVG")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import os
 import sys
 import time
@@ -26,6 +25,7 @@ from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.eval.reports.progress import kernels_to_compile
 from arena_newton.eval.workers.messages import ActionFile, Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
+from arena_newton.files.new_folder import held
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.policies.base import Policy
 
@@ -117,11 +117,11 @@ def _alone_while_compiling(engine: str, device: str) -> Iterator[None]:
         yield
         return
     cache.mkdir(parents=True, exist_ok=True)
-    with open(cache / COMPILE_LOCK, "wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not kernels_to_compile(cache, engine, device):
-            fcntl.flock(lock, fcntl.LOCK_UN)
-        yield
+    with held(cache / COMPILE_LOCK, wait=True):
+        if kernels_to_compile(cache, engine, device):
+            yield
+            return
+    yield
 
 
 class _BatchFolder(ResultsFolder):

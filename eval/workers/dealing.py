@@ -32,7 +32,7 @@ from arena_newton.eval.play.run_flow import (
     progress_of,
     reported,
 )
-from arena_newton.eval.records.journal import SCHEMA, EpisodeRecord, Journal, write_atomic
+from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecord, write_atomic
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.backend import PoolBackend
 from arena_newton.eval.workers.messages import ActionFile, Built, Done, Ended, Event, Opened, Ticks
@@ -52,7 +52,7 @@ SMALLER = 4
 ALONE = 2
 """Losses after which an episode is played alone."""
 GIVEN_UP = 5
-"""So many episodes of a task, tracker and mode that end as errors before one ends otherwise stop the run."""
+"""Number of episodes of a task, tracker and mode that stop the run if they end as errors before one ends otherwise."""
 
 
 def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
@@ -84,27 +84,17 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
     with contextlib.ExitStack() as ended:
         ended.callback(pool.dismiss)
         config = pool.opened(job)
-        folder.make()
-        journal = ended.enter_context(Journal(folder.journal))
-        folder.prepare(config, journal.records)
-        folder.sweep()
-        ended.callback(_swept, pool, folder)
+        journal = ended.enter_context(folder.opened(config))
+        ended.callback(pool.dismiss)  # who writes files has ended before those that are not whole are removed
         try:
             with naming_the_command(resume, lambda: kept(config, journal.records)):
-                done, waiting = begun(config, folder, journal)
+                done, waiting = begun(config, folder, journal.records)
                 if waiting:
                     _play(DealtRun(job, journal, pool, done, waiting, progress_of(config, done, waiting)))
         except KeyboardInterrupt:
             print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
             return False
     return True
-
-
-def _swept(pool: WorkerPool, folder: ResultsFolder) -> None:
-    """Remove what unfinished recordings left, once who writes them has ended."""
-    if any(worker.assignment is not None for worker in pool.workers):
-        pool.dismiss()
-    folder.sweep()
 
 
 def _play(run: DealtRun) -> None:
@@ -139,7 +129,7 @@ class DealtRun:
     def __init__(
         self,
         job: Job,
-        journal: Journal,
+        journal: EpisodeLines,
         pool: WorkerPool,
         ended: dict[int, EpisodeRecord],
         waiting: dict[Group, list[Episode]],

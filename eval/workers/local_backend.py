@@ -85,7 +85,7 @@ class LocalBackend:
             print(f"  {self.flag}: processes share {counted(self._cores, 'core')}", file=sys.stderr, flush=True)
 
     def room(self) -> int:
-        """As many as were asked for."""
+        """Number of processes that were requested."""
         return self._jobs
 
     def demand(self) -> str:

@@ -65,7 +65,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Ticks:
-    """So many ticks of worlds went by."""
+    """Ticks of worlds that have passed."""
 
     count: int
 

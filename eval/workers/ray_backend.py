@@ -197,7 +197,7 @@ class RayBackend:
             raise InputError(f"{flag}: a process {self.demand()}")
 
     def room(self) -> int:
-        """As many as the cluster holds now, or as --ray-actors says."""
+        """Number of processes that the cluster holds now, or that of --ray-actors."""
         return self._actors or max(1, sum(map(self._held, _nodes().values())))
 
     def demand(self) -> str:

@@ -196,7 +196,7 @@ def _plain(value: Json) -> Json:
 
 
 def _joined(runs: Sequence[RunRecord]) -> tuple[list[_Kept], list[str]]:
-    """Of each episode the one that counts, in the plan's order, and notes on those that several folders have.
+    """Episodes that count, one of each, in the plan's order, and notes on those that several folders have.
 
     Raises:
         InputError: Two folders played an episode, and something else came of it.

@@ -58,8 +58,7 @@ class Job:
     def configured(self) -> RunConfig:
         """The configuration, with what tracker and policy of the first process say of themselves."""
         assert self.opened is not None
-        described = ("labels", "worlds_matter", "tracker_facts", "policy_facts")
-        return dataclasses.replace(self.folder.config, **{name: getattr(self.opened, name) for name in described})
+        return self.folder.config.described_by(self.opened)
 
     def options(self) -> RunOptions:
         """The flags that a process opens it with."""

@@ -20,10 +20,12 @@ import warp as wp
 from arena_newton.kernels.launching import launch
 from arena_newton.kernels.pictures.raster import srgb
 
-__all__ = ["launch_camera_poses", "launch_shade"]
+__all__ = ["FULL_LIGHT", "launch_camera_poses", "launch_shade"]
 
-EXPOSURE = wp.constant(wp.float32(1.0 / 1700.0))
-"""Scale from light intensity units to the tone curve; puts the original's dome (3000 · 0.75) at 1.32."""
+FULL_LIGHT = 1700.0
+"""Light intensity at 1 of the tone curve, which puts the original's dome (3000 · 0.75) at 1.32."""
+EXPOSURE = wp.constant(wp.float32(1.0 / FULL_LIGHT))
+"""Scale from light intensity units to the tone curve."""
 BOUNCE = wp.constant(wp.float32(0.45))
 """Fraction of the dome's light that a surface facing straight down receives from the floor."""
 AMBIENT = wp.constant(wp.float32(0.2))

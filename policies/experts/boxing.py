@@ -316,7 +316,7 @@ class BoxingExpert(Expert):
         self._phases.enter("approach", mask)
 
     def _try_again(self, mask: Tensor) -> None:
-        """After a miss move by what the palm missed; when that did not help, go to another side."""
+        """Move by what the palm missed, after a miss; when that did not help, go to another side."""
         if not mask.any():
             return
         self._tries = self._tries + mask

@@ -41,7 +41,7 @@ class Paths:
     """Planned paths, one per world."""
 
     points: Tensor
-    """From the start to the goal [m], shape [worlds, points, 2]; the last point is repeated."""
+    """Points from the start to the goal [m], shape [worlds, points, 2]; the last one is repeated."""
     length: Tensor
     """[m], `BLOCKED` or more where there is none (the path is then straight), shape [worlds]."""
     clearance: Tensor

@@ -34,7 +34,7 @@ SHOULDER_PITCHES, ELBOWS = [0, 7], [3, 10]
 """Among the 14 columns of `MotionCommand.arms`."""
 
 LIMITS = NavigationLimits(forward=0.58, turn=0.9, sideways=0.28)
-"""Of the walk to the gate: faster than the navigator's own, for the step budget of `paper` is short."""
+"""Limits of the walk to the gate: faster than the navigator's own, for the step budget of `paper` is short."""
 GATE_ASIDE = (0.26, 0.34, 0.42, 0.50, 0.60, 0.70)
 """Distances beyond the end of the seat at which the robot may turn its back to the sofa [m]. The armrest ends 0.10 m
 beyond it."""
@@ -107,7 +107,7 @@ ARMS_UP, ELBOWS_OUT = 0.15, 0.20
 
 
 class SitSofaExpert(Expert):
-    """To the gate, sideways in front of the seat, back to its edge, down; where the seat was missed, up and again."""
+    """Walks to the gate, sideways in front of the seat, back to its edge, and sits; rises and repeats after a miss."""
 
     task = "sit_sofa"
 
@@ -234,7 +234,7 @@ class SitSofaExpert(Expert):
         fraction = torch.where(at("sit"), 1.0, self.phase.fraction)
 
         def course(start: Tensor, touch: float, end: float, up: float) -> Tensor:
-            """From `start` to the touch, to the end, and up again."""
+            """Course from `start` to the touch, to the end, and up again."""
             value = torch.where(lowering, start + fraction * (touch - start), start)
             value = torch.where(pressing, touch + fraction * (end - touch), value)
             return value.masked_fill(rising, up)

@@ -35,7 +35,7 @@ APART = 0.42
 MOVED = 0.06
 """An obstacle that moved farther than this since the plan was made requires a new one [m]."""
 STRAY = 0.35
-"""So does a robot that is farther from its path than this [m]."""
+"""Distance from its path beyond which a robot does so too [m]."""
 CORNER = 0.05
 """Points of a path closer to each other than this count as one [m]."""
 LONGEST = 25.0

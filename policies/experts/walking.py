@@ -27,7 +27,7 @@ class Walk:
     """Goal and route of each world, and the navigator that follows them."""
 
     def __init__(self, sight: Sight, limits: NavigationLimits | None = None):
-        """Without goals: call `to` before `command`."""
+        """Make one without goals: call `to` before `command`."""
         self.sight = sight
         self.navigator = Navigator(sight.worlds, sight.device, limits)
         self.goal = torch.zeros(sight.worlds, 3, device=sight.device)

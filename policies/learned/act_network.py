@@ -91,7 +91,7 @@ class ResidualBlock(nn.Module):
     """Two convolutions beside a short cut."""
 
     def __init__(self, inputs: int, outputs: int, stride: int):
-        """With random weights."""
+        """Make one with random weights."""
         super().__init__()
         self.conv1, self.bn1 = _convolution(inputs, outputs, 3, stride), FrozenNorm(outputs)
         self.conv2, self.bn2 = _convolution(outputs, outputs, 3), FrozenNorm(outputs)
@@ -110,7 +110,7 @@ class VisionEncoder(nn.Module):
     """A residual network without its classifier."""
 
     def __init__(self, name: str):
-        """With random weights.
+        """Make one with random weights.
 
         Args:
             name: A key of `BLOCKS`.
@@ -156,7 +156,7 @@ class AttentionLayer(nn.Module):
     """A layer of the encoder, or of the decoder with `crossed` attention to what the encoder says."""
 
     def __init__(self, sizes: ActSizes, crossed: bool):
-        """With random weights."""
+        """Make one with random weights."""
         super().__init__()
         width, self.pre_norm, self.crossed = sizes.dim_model, sizes.pre_norm, crossed
         self.activation = ACTIVATIONS[sizes.feedforward_activation]
@@ -197,7 +197,7 @@ class LayerStack(nn.Module):
     """Layers and the normalisation behind them."""
 
     def __init__(self, sizes: ActSizes, crossed: bool):
-        """With random weights."""
+        """Make one with random weights."""
         super().__init__()
         count = sizes.n_decoder_layers if crossed else sizes.n_encoder_layers
         self.layers = nn.ModuleList([AttentionLayer(sizes, crossed) for _ in range(count)])
@@ -208,7 +208,7 @@ class ActNetwork(nn.Module):
     """One picture, a state and a task in, a chunk of actions out; all of them normalised."""
 
     def __init__(self, sizes: ActSizes):
-        """With random weights; see `load`."""
+        """Make one with random weights; see `load`."""
         super().__init__()
         width = sizes.dim_model
         self.sizes = sizes

@@ -105,7 +105,7 @@ class PolicyCard:
     device: str = ""
     """Device of the training."""
     datasets: Annotated[tuple[Mapping[str, object], ...], Fit("a list of objects")] = ()
-    """Of each dataset of its training: name, hash, episodes, frames."""
+    """Datasets of its training: name, hash, episodes, frames of each."""
     looks: tuple[str, ...] = ()
     """Fraction of its samples whose looks were changed, then those of single tasks, as `--looks` has them."""
     command: str = ""
@@ -115,7 +115,7 @@ class PolicyCard:
     weights: str = ""
     """First 12 hex digits of the SHA-256 of the packed weights."""
     precision: str = "float16"
-    """Of its matrices; vectors are float32, and it computes in float32."""
+    """Precision of its matrices; vectors are float32, and it computes in float32."""
     bytes: int = 0
     """Size of all files but the card [bytes]."""
     note: str = ""

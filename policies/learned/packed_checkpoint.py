@@ -66,11 +66,11 @@ class Spread:
     eps: float
 
     def normalised(self, value: torch.Tensor) -> torch.Tensor:
-        """As the network receives it."""
+        """Value as the network receives it."""
         return (value - self.mean) / (self.std + self.eps)
 
     def restored(self, value: torch.Tensor) -> torch.Tensor:
-        """From the network's units."""
+        """Value converted from the network's units."""
         return value * self.std + self.mean
 
     def to(self, device: torch.device) -> Spread:

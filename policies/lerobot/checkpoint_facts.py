@@ -76,7 +76,7 @@ class CheckpointFacts:
     device: str = ""
     """Device of the training, such as `NVIDIA H200`."""
     datasets: tuple[Mapping[str, object], ...] = ()
-    """Of each dataset: `name`, `hash` of its content, `episodes`, `frames`."""
+    """Datasets of the training: `name`, `hash` of its content, `episodes`, `frames` of each."""
     options: Mapping[str, object] = field(default_factory=dict)
     """The training's resolved options."""
 

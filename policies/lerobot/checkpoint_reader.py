@@ -89,7 +89,7 @@ class PolicyCheckpoint:
     """Contents of a checkpoint, checked."""
 
     folder: Path
-    """With `config.json`."""
+    """Folder with `config.json`."""
     config: PreTrainedConfig
     """LeRobot's configuration of the policy; nothing in it makes LeRobot download or compile."""
     facts: CheckpointFacts

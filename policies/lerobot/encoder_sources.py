@@ -79,7 +79,7 @@ class ClipShape:
         return clip_from(lambda: CLIPVisionModel(self.vision), lambda: CLIPTextModel(self.text))
 
     def whole(self) -> CLIPConfig:
-        """As transformers write it."""
+        """Configuration as transformers write it."""
         width = self.vision.hidden_size
         parts = {"text_config": self.text.to_dict(), "vision_config": self.vision.to_dict()}
         return CLIPConfig.from_dict({**parts, "projection_dim": width})

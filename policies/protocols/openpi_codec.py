@@ -68,10 +68,12 @@ def pack_metadata(facts: ServedFacts, *, roboarena: bool = False) -> bytes:
         roboarena: Only the fields of RoboArena's `PolicyServerConfig`, whose clients may refuse any other key.
     """
     size = facts.picture and [facts.picture.height, facts.picture.width]
+    cameras = facts.cameras or [FRONT] * bool(facts.needs_picture)
+    wrist = [name for name in cameras if "wrist" in name]
     content: dict[str, object] = {
         "image_resolution": size,
-        "needs_wrist_camera": any("wrist" in name for name in facts.cameras or ()),
-        "n_external_cameras": int(bool(facts.needs_picture)),
+        "needs_wrist_camera": bool(wrist),
+        "n_external_cameras": len(cameras) - len(wrist),
         "needs_stereo_camera": False,
         "needs_session_id": True,
         "action_space": f"arena_{facts.labels}",

@@ -69,12 +69,12 @@ class Query:
     """Picture of each camera by its name (`pictures.settings.CAMERAS`), uint8, shape [H, W, 3], red first; or as its
     sender packed it."""
     task: str = ""
-    """As in `Begin`."""
+    """Task as in `Begin`."""
     instruction: str = ""
     session: str = ""
-    """As in `Begin`."""
+    """Session as in `Begin`."""
     seed: int | None = None
-    """As in `Begin`; with `step` 0 it begins an episode that no `Begin` has announced."""
+    """Seed as in `Begin`; with `step` 0 it begins an episode that no `Begin` has announced."""
     step: int | None = None
     """Actions that the episode has executed so far; None: not given."""
     robot_type: str = ""
@@ -91,7 +91,7 @@ class End:
     """An episode is over."""
 
     session: str = ""
-    """As in `Begin`."""
+    """Session as in `Begin`."""
     result: Mapping[str, object] = field(default_factory=dict)
     """The robot's report of it."""
 

@@ -32,7 +32,7 @@ RECIPES: dict[str, tuple[str, ...]] = {
 }
 """Recipe → families that have it."""
 BETAS = (0.9, 0.999)
-"""Of AdamW where the policy's configuration has none: LeRobot's `AdamWConfig`."""
+"""Betas of AdamW where the policy's configuration has none: LeRobot's `AdamWConfig`."""
 GRAD_CLIP = 10.0
 """Norm of the gradient where the policy's configuration has none: LeRobot's `AdamConfig`, `AdamWConfig`."""
 REALIGN = 0.002
@@ -340,6 +340,7 @@ _CHANGES: dict[tuple[str, str], dict[str, object]] = {
     ("*", "compact"): _FAST,
     ("act", "compact"): {
         "batch_norm": True,
+        "frozen_norms": 0.3,
         "cut_pad": True,
         "use_task_vector": True,
         "network": {

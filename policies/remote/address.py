@@ -58,7 +58,7 @@ class ServerAddress:
     host: str
     port: int
     path: str
-    """In front of the protocol's own routes, without a slash at its end."""
+    """Path in front of the protocol's own routes, without a slash at its end."""
 
     @property
     def secure(self) -> bool:
@@ -129,5 +129,5 @@ def one_line(text: object) -> str:
 
 
 def cause(error: BaseException) -> str:
-    """Why something failed, on one line."""
+    """Cause of a failure, on one line."""
     return one_line(getattr(error, "strerror", None) or str(error) or type(error).__name__)

@@ -164,13 +164,13 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
     """The original's client sends the head camera as it is, 640×480; resizing is the server's work."""
 
     def __init__(self, url: str, **options: Any):
-        """As of `RemoteClient`."""
+        """Make a client with the options of `RemoteClient`."""
         super().__init__(url, **options)
         self._name = secrets.token_hex(8)
 
     @property
     def headers(self) -> dict[str, str]:
-        """With a name, by which a server tells the worlds of this client from those of others on this machine."""
+        """Headers with a name that keeps this client's worlds apart from those of others on this machine."""
         return {**super().headers, arena_codec.CLIENT_HEADER: self._name}
 
     def check(self) -> None:

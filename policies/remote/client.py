@@ -208,7 +208,7 @@ class RemoteClient[Q, R](Policy):
             InputError: They differ; the message names both values.
         """
         where = f"--policy remote:{self.url}"
-        # `--labels v4` is a statement; v3.1 is also what is meant where nothing is said.
+        # `--labels v4` is a statement; v3.1 is also the default.
         asked = self.protocol.name if self.protocol is not LABELS["v3.1"] else None
         try:
             compare_facts(facts, expected_facts(asked or facts.labels or self.protocol.name), where)

@@ -102,7 +102,7 @@ class ServerLink[Q, R]:
         raise TypeError(f"{type(self).__name__} defines no exchange()")
 
     def busy_signal(self, reply: R) -> str:
-        """Why the same should be asked again later; an empty text where the reply is one."""
+        """Reason to send the same request again later; an empty text where the reply is an answer."""
         return ""
 
     def probe(self, end: float) -> object:

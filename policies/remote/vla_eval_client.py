@@ -43,7 +43,7 @@ class VlaEvalLink(SocketLink):
         return facts
 
     def begin(self, begin: Begin, end: float) -> object:
-        """Begin an episode; nobody answers that, and what went wrong is told with the first query."""
+        """Begin an episode; nobody answers that, and an error is reported with the first query."""
         if self.begun:
             self._number()
             self.send(vla_eval_codec.pack_request(End(begin.session), self.seq, time.time()))

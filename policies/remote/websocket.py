@@ -239,7 +239,7 @@ class SocketClient(RemoteClient[SocketRequest, object]):
     """A client of a protocol over websockets."""
 
     def refused(self, facts: ServedFacts) -> str:
-        """Why a server that greets like this is not the one that was checked; an empty text where it is."""
+        """Reason for which a server with this greeting is not the one that was checked; an empty text where it is."""
         if not self._checked or facts == self.greeting:
             return ""
         return "the server that answers now declares something else than the one that was there at the beginning"
@@ -322,7 +322,7 @@ def _cut(connection: socket.socket) -> None:
 
 
 def _closed(error: ConnectionClosed) -> str:
-    """Why a connection was closed."""
+    """Reason for which a connection was closed."""
     if error.rcvd is None:
         return "the connection broke"
     return f"the server closed the connection ({error.rcvd.code}{f' {cause(error)}' if error.rcvd.reason else ''})"

@@ -1,6 +1,6 @@
 """Endpoint of the original benchmark's HTTP protocol: a thread for each connection, JSON in and out.
 
-Which robot a request is of is said by `policies.serve.http_robots`.
+`policies.serve.http_robots` finds the robot of a request.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Listener
 
     def handle(self) -> None:
-        """Serve until the client leaves; one connection too many is told so."""
+        """Serve until the client leaves; a connection beyond the limit is refused with a message."""
         self.room = False
         with self.server.listed(self.connection), ExitStack() as self.visit:
             super().handle()
@@ -135,7 +135,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.room
 
     def _body(self) -> bytearray | None:
-        """The body of a request; None where it cannot be read and the client was told so."""
+        """The body of a request; None where it cannot be read and the client has got an error."""
         lengths = self.headers.get_all("Content-Length") or []
         if self.headers.get("Transfer-Encoding") or len(lengths) != 1 or not lengths[0].isascii():
             self._hang_up(411, "a body needs one Content-Length")

@@ -32,10 +32,10 @@ _HUNG_UP = getattr(select, "POLLRDHUP", select.POLLHUP)
 
 @dataclass(eq=False)
 class HttpRobot:
-    """One robot, as far as it can be told from others."""
+    """One robot, as far as requests distinguish it from others."""
 
     owner: str
-    """Whom its session belongs to."""
+    """Owner of its session."""
     session: str
     """World and seed of its episode."""
     connection: socket.socket | None
@@ -48,7 +48,7 @@ class HttpRobots:
     """The robots of all addresses; safe to ask from the threads of all connections."""
 
     def __init__(self) -> None:
-        """Without robots."""
+        """Make a list without robots."""
         self._robots: OrderedDict[tuple[str, str, str], list[HttpRobot]] = OrderedDict()
         """Address, client and world → robots, the one that asked last at the end."""
         self._numbers = itertools.count(1)

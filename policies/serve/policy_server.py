@@ -55,7 +55,7 @@ WARM_UP_SEED = 0
 """Seed of the query before the first one, which nobody is answered."""
 
 type Reason = Literal["unfit", "unknown_episode", "full", "policy", "closing"]
-"""Why a request is refused: what it says, an unknown episode, no free row, the policy failed, or the server ends."""
+"""Reason of a refusal: unfit content, an unknown episode, no free row, the policy failed, or the server ends."""
 
 
 class Refused(ArenaError):
@@ -74,7 +74,7 @@ class Answer:
     actions: np.ndarray
     """The chunk, float32, shape [n, 40]."""
     infer_ms: float
-    """From the request to its answer, waiting for a batch included [ms]."""
+    """Time from the request to its answer, waiting for a batch included [ms]."""
 
 
 @dataclass
@@ -133,7 +133,7 @@ class _Session:
     last: tuple[int | None, int] | None = None
     """Step and content of the last query."""
     answer: np.ndarray | None = None
-    """To the last query."""
+    """Answer to the last query."""
 
     def follows(self, step: int) -> bool:
         """True if a query may come so many actions into the episode: at most the last chunk after the last query."""
@@ -258,7 +258,7 @@ class PolicyServer:
 
         Args:
             owner: Connection, or whoever the session belongs to.
-            begin: What is said of the episode.
+            begin: The client's description of the episode.
             held: The session lives until its owner leaves; otherwise it may lose its row when it is idle.
 
         Raises:

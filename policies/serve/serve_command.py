@@ -12,7 +12,8 @@ from pathlib import Path
 import torch
 
 from arena_newton import tasks
-from arena_newton.errors import InputError, naming
+from arena_newton.errors import InputError
+from arena_newton.physics.devices import torch_device
 from arena_newton.policies.base import Policy, get
 from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.protocols.ports import bind, is_local
@@ -55,7 +56,7 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
     tls = _tls(options)
     if options.task is not None:
         tasks.get(options.task)
-    device = _device(options.device)
+    device = torch_device(options.device)
     policy = make_policy(options, device)
     server = PolicyServer(
         policy,
@@ -95,14 +96,10 @@ def make_policy(options: ServeOptions, device: torch.device) -> Policy:
     """The policy that is served, decoded to v3.1 unless its own labels are wanted.
 
     Raises:
-        InputError: There is no such policy, or it is of other labels than it is said to be.
+        InputError: There is no such policy, or its labels are others than the stated ones.
     """
-    more: dict[str, object] = {}
-    if options.policy.partition(":")[0] == "lerobot":
-        more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
-    elif options.replan is not None or options.ensemble:
-        raise InputError("--replan and --ensemble: of a checkpoint only, --policy lerobot:<checkpoint>")
-    policy = get(options.policy, **{name: value for name, value in more.items() if value is not None})
+    more = {"replan": options.replan, "ensemble": options.ensemble, "device": str(device)}
+    policy = get(options.policy, **more if options.policy.partition(":")[0] == "lerobot" else {})
     labels = options.labels or getattr(policy, "labels", None) or "v3.1"
     decoded = read_by(policy, labels)
     if not options.raw_labels:
@@ -132,21 +129,6 @@ def open_endpoint(
         case "openpi" | "roboarena" | "vla-eval" as protocol:
             return WebsocketEndpoint(server, listening, protocol, guard, tls)
     raise InputError(f"--protocol {options.protocol}: unknown")
-
-
-def _device(name: str | None) -> torch.device:
-    with naming(f"--device {name}:"):
-        try:
-            device = torch.device(name or ("cuda" if torch.cuda.is_available() else "cpu"))
-        except RuntimeError:
-            raise InputError("no such device, expected cpu, cuda or cuda:<number>") from None
-        if device.type not in ("cpu", "cuda"):
-            raise InputError("expected cpu, cuda or cuda:<number>")
-        if device.type == "cpu" and device.index:  # torch knows one, and takes any number
-            raise InputError("there is one CPU device, --device cpu")
-        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-            raise InputError(f"there are {torch.cuda.device_count()} CUDA devices")
-    return device
 
 
 def _tls(options: ServeOptions) -> ssl.SSLContext | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from arena_newton.cli.flags import Device, bounds, check_bounds
 from arena_newton.errors import InputError
+from arena_newton.policies.chunk_flags import ChunkFlags
 
 __all__ = ["PROTOCOLS", "ServeOptions"]
 
@@ -16,8 +17,8 @@ MOST_SESSIONS = 4096
 
 
 @dataclass(frozen=True)
-class ServeOptions:
-    """Options of a policy server."""
+class _Served:
+    """Policy, and who may ask it."""
 
     policy: str = ""
     """Policy: stand, learned, lerobot:<checkpoint>, replay:<file>, another package's, or remote:<url> to pass on."""
@@ -25,27 +26,26 @@ class ServeOptions:
     """Protocol of the clients: openpi roboarena vla-eval arena (the original's HTTP)."""
     host: str = "127.0.0.1"
     """Address of this machine that is served; 0.0.0.0 lets others in, who then need ARENA_POLICY_TOKEN."""
-    port: int = 8000
+    port: int = field(default=8000, metadata=bounds(0, 65535))
     """TCP port; 0 takes a free one and prints it."""
-    max_batch_size: int = 16
+    max_batch_size: int = field(default=16, metadata=bounds(1, MOST_SESSIONS))
     """Most queries in one call of the policy."""
-    max_wait: float = 0.02
+    max_wait: float = field(default=0.02, metadata=bounds(0.0, 60.0))
     """Longest wait of a batch's first query for others [s]."""
-    max_sessions: int = 64
+    max_sessions: int = field(default=64, metadata=bounds(1, MOST_SESSIONS))
     """Most episodes at once: rows of the policy. Eight connections more are taken."""
-    device: str | None = None
-    """Torch device of the policy: cpu, cuda, cuda:1; the best there is when none is named."""
+    device: Device[str | None] = None
     task: str | None = None
     """Task of the query before the first one, by which everything is loaded and compiled; one that the policy does when
     none is named."""
     tracker: str = ""
     """Tracker of the robots, for a policy that is given its name; unknown by default: no protocol says it."""
-    replan: int | None = None
-    """Actions of a chunk that are executed before the next query, of a checkpoint; its own number by default."""
-    ensemble: bool = False
-    """Average the chunks that cover a tick, of a checkpoint."""
-    labels: str | None = None
-    """Label protocol of the policy's actions, v3.1 or v4, where it does not say so itself."""
+
+
+@dataclass(frozen=True)
+class ServeOptions(ChunkFlags, _Served):
+    """Let a policy answer over the network."""
+
     raw_labels: bool = False
     """Give actions of v4 as they are and declare them so; otherwise they are decoded to v3.1."""
     tls_cert: str | None = None
@@ -65,15 +65,7 @@ class ServeOptions:
             raise InputError(f"--protocol {self.protocol}: unknown, choose from {', '.join(PROTOCOLS)}")
         if not self.host:
             raise InputError("--host: is empty, expected an address of this machine; 0.0.0.0 is all of them")
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"--port {self.port}: expected 0 to 65535")
-        if not 1 <= self.max_sessions <= MOST_SESSIONS:
-            raise InputError(f"--max-sessions {self.max_sessions}: expected 1 to {MOST_SESSIONS}")
-        if not 1 <= self.max_batch_size <= MOST_SESSIONS:
-            raise InputError(f"--max-batch-size {self.max_batch_size}: expected 1 to {MOST_SESSIONS}")
-        if not (math.isfinite(self.max_wait) and 0.0 <= self.max_wait <= 60.0):
-            raise InputError(f"--max-wait {self.max_wait:g}: expected seconds from 0 to 60")
-        if self.replan is not None and self.replan < 1:
-            raise InputError(f"--replan {self.replan}: expected at least 1")
+        check_bounds(self)
+        self.check_chunks(self.policy)
         if (self.tls_cert is None) != (self.tls_key is None):
             raise InputError("--tls-cert and --tls-key: name both or none")

@@ -26,7 +26,7 @@ COMMANDS = {
         extras={"teleop": ("redis",)},
     ),
 }
-"""By name."""
+"""Commands by name."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

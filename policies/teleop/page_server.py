@@ -49,7 +49,7 @@ LONGEST_MESSAGE = 4096
 STATUS_PERIOD = 0.1
 """Time between two messages of state to the page [s]."""
 JPEG_QUALITY = 80
-"""Of the head camera's pictures, in percent."""
+"""Quality of the head camera's pictures, in percent."""
 PAGES = 8
 """Most pages at once, all but one of which have been taken over."""
 PONG_SECONDS = 20.0
@@ -72,7 +72,7 @@ class PageServer:
         Args:
             listening: The port, from `ports.bind`; it belongs to the server from now on.
             token: What every address must name; `new_token` makes one.
-            facts: What the page is told once, as JSON.
+            facts: Facts that the page gets once, as JSON.
             frame: Address of the page that shows the world; None: none.
         """
         self._token = token

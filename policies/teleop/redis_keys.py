@@ -119,7 +119,7 @@ BACKENDS: Mapping[str, Backend] = {
     "twist2": Backend("twist2", _COMMON),
     "sonic_joint29": Backend("sonic_joint29", _COMMON + _GMR),
 }
-"""By name: `twist2` sends the mimic command, `sonic_joint29` root pose and joints of the retargeted person."""
+"""Formats by name: `twist2` sends the mimic command, `sonic_joint29` root pose and joints of the retargeted person."""
 
 
 def parse(key: str, raw: bytes) -> object:
@@ -183,7 +183,7 @@ def closed_hands(controllers: bytes, hands: tuple[bytes, bytes]) -> np.ndarray |
         hands: Values of `ACTION_HANDS`; each decides where its controller says nothing: nearer to closed than to open.
 
     Returns:
-        None where nothing is said of either hand; a hand of which alone nothing is said is open.
+        None where neither hand is mentioned; a hand that alone is not mentioned is open.
 
     Raises:
         InputError: A value is something else than it must be.

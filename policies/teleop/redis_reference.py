@@ -1,4 +1,4 @@
-"""From a sender's reference to canonical actions: TWIST2's mimic command, or a retargeted person's root and joints.
+"""Canonical actions of a sender's reference: TWIST2's mimic command, or a retargeted person's root and joints.
 
 Displacements and headings count from the episode's first frame, as in the labels of the original's datasets. A sender
 that jumps is limited: see `Limits`.

@@ -37,11 +37,11 @@ ANSWER = 0.1
 AGAIN = 1.0
 """Time between two attempts to reach a lost server [s]."""
 QUALITY = 80
-"""Of the head camera's JPEG."""
+"""Quality of the head camera's JPEG."""
 COMMANDS: dict[str, Control] = {name: name for name in get_args(Control) if name != "quit"}
 """The original's commands, which are the session's."""
 MOST_LINES = 50
-"""Kinds of unfit input that are told."""
+"""Most kinds of unfit input that are reported."""
 RESET: Control = "discard_and_reset"
 """Control for a reset from outside: an episode that was reset is no demonstration."""
 
@@ -109,7 +109,7 @@ class RedisSource:
         )
 
     def begin(self, view: Telemetry) -> None:
-        """An episode begins: whatever was sent before is forgotten, and the sender is told that input counts from now.
+        """An episode begins: what was sent before is forgotten, and the sender is notified that input counts from now.
 
         After the person's own `start` the sender's stream goes on as it is: a new epoch would put it back to idle.
         """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from arena_newton.cli.flags import Device, Engine
 from arena_newton.policies.protocols.ports import bind
 
 __all__ = ["BrowserOptions", "RedisOptions", "SessionOptions"]
@@ -25,10 +26,8 @@ class SessionOptions:
     """USD file that replaces or extends the task's scene."""
     rules: str = "paper"
     """Rule set: paper or released."""
-    engine: str = "auto"
-    """Physics engine: mujoco (CPU), warp (CUDA or CPU), auto (warp where there is CUDA)."""
-    device: str | None = None
-    """Device of engine warp and of the networks: cpu, cuda, cuda:1; the best there is when none is named."""
+    engine: Engine = "auto"
+    device: Device[str | None] = None
     fast_physics: bool = False
     """Run a 1 ms tracker at 5 ms x 4 substeps, on a machine that is too slow for real time."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""From a trained checkpoint to the form in which a policy ships: half precision, a card, at most 32 MB.
+"""Packing of a trained checkpoint into the form in which a policy ships: half precision, a card, at most 32 MB.
 
 What is written is still a checkpoint that a stock LeRobot loads. Matrices are stored in float16, vectors (statistics of
 batches among them, whose variances can exceed float16's range) in float32; both loaders compute in float32.

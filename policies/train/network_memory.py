@@ -20,11 +20,11 @@ class NetworkSize:
 
     parameters: int
     parameter_bytes: int
-    """Of a parameter: itself, its gradient, AdamW's two moments, and their copies while a graph is captured."""
+    """Bytes of a parameter: itself, its gradient, AdamW's two moments, and their copies while a graph is captured."""
     sample_bytes: int
     """Activations of a sample that the backward pass needs."""
     stored_bytes: int
-    """Of a parameter in a checkpoint: itself, and AdamW's two moments where it is trained."""
+    """Bytes of a parameter in a checkpoint: itself, and AdamW's two moments where it is trained."""
 
 
 SIZES = {
@@ -40,7 +40,7 @@ SIZES = {
     # 2048 numbers are kept, and one layer's activations (0.2 MB a token) exist at a time.
     "pi05": NetworkSize(3_620_000_000, 9, 250_000_000, 6),
 }
-"""Of `paper`, which no other recipe exceeds; counted, and computed where nothing was measured."""
+"""Memory of `paper`, which no other recipe exceeds; counted, and computed where nothing was measured."""
 
 SMALLER = {
     ("act", "fast"): 34_200_000,

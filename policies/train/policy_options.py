@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from arena_newton.cli.flags import Several, flag_name
+from arena_newton.cli.flags import Device, Engine, Several, bounds, check_bounds
 from arena_newton.errors import InputError
 from arena_newton.pictures.settings import CAMERAS, FRONT
+from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 __all__ = [
     "PolicyTrainOptions",
     "TeachableOptions",
-    "bounds",
     "check_choices",
     "check_numbers",
-    "check_ranges",
     "check_teachable",
     "look_fractions",
     "task_weights",
@@ -37,14 +31,9 @@ BALANCES = ("picture", "task")
 """Draws of the samples."""
 
 
-def bounds(low: float, high: float = math.inf) -> dict[str, tuple[float, float]]:
-    """Metadata of a flag whose number is within these bounds."""
-    return {"range": (low, high)}
-
-
 @dataclass(frozen=True)
 class PolicyTrainOptions:
-    """Train a policy on datasets of demonstrations."""
+    """Train a policy on datasets of demonstrations; with torchrun each process takes a GPU of its own."""
 
     policy: str = "act"
     """Family: act, diffusion, flow or pi05."""
@@ -86,9 +75,8 @@ class PolicyTrainOptions:
     lr: float = field(default=0.0, metadata=bounds(0.0, 1.0))
     """Learning rate after the warm-up; 0: the recipe's."""
     seed: int | None = field(default=None, metadata=bounds(0, 2**31))
-    """Of weights, order, augmentation and noise; the recipe's by default."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N or auto; with torchrun each process takes a GPU of its own."""
+    """Seed of weights, order, augmentation and noise; the recipe's by default."""
+    device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
     save_every: int = field(default=5000, metadata=bounds(0))
@@ -104,7 +92,7 @@ class PolicyTrainOptions:
     log_every: int = field(default=50, metadata=bounds(1))
     """Steps between rows of the log."""
     graph: bool = True
-    """On CUDA: capture batch and step in one CUDA graph."""
+    """Capture batch and step in one CUDA graph, on CUDA."""
     compile: bool = False
     """Compile the network with torch.compile, which takes a minute or so at the first step; not for pi05."""
     jobs: int = field(default=0, metadata=bounds(0, 1024))
@@ -134,17 +122,15 @@ class TeachableOptions:
     chunk: int = field(default=20, metadata=bounds(1, 1000))
     """Actions of an answer, which are executed whole."""
     seed: int = field(default=0, metadata=bounds(0, 2**31))
-    """Of weights, order and noise."""
+    """Seed of weights, order and noise."""
     episodes: int = field(default=30, metadata=bounds(1, 1000))
     """Episodes that are played, spread over the protocol's group seeds 0 1 2."""
     worlds: int = field(default=30, metadata=bounds(1, 4096))
     """Episodes that are simulated at once."""
     max_steps: int | None = field(default=None, metadata=bounds(1, 10_000_000))
     """Cap on the step budget of the task [ticks of 0.02 s]."""
-    engine: str = "mujoco"
-    """Physics engine: mujoco, warp or auto."""
-    device: str = "cpu"
-    """Device of the worlds: cpu, cuda, cuda:N."""
+    engine: Engine = "mujoco"
+    device: Device[str] = "cpu"
     out: Path | None = None
     """Write the result to this JSON file."""
 
@@ -155,27 +141,11 @@ def check_teachable(options: TeachableOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_ranges(options)
+    check_bounds(options)
     if options.recording == Path() or not options.recording.is_dir():
         raise InputError(f"--recording {options.recording}: name a folder that eval record wrote")
     if not options.task:
         raise InputError("--task: name the task of the demonstrations")
-
-
-def check_ranges(options: DataclassInstance) -> None:
-    """Refuse numbers that are out of the ranges of their fields.
-
-    Raises:
-        InputError: One is.
-    """
-    for one in dataclasses.fields(options):
-        if "range" in one.metadata:
-            low, high = one.metadata["range"]
-            value = getattr(options, one.name)
-            if value is not None and not (low <= value <= high and math.isfinite(value)):
-                flag = flag_name(one.name)
-                until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-                raise InputError(f"{flag} {value}: expected a number {until}")
 
 
 def task_weights(given: Sequence[str]) -> dict[str, float]:
@@ -243,12 +213,12 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_ranges(options)
+    check_bounds(options)
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if options.steps and options.minutes:
         raise InputError("--steps: is given by --minutes too; drop one of them")
-    if options.labels not in ("", "v3.1", "v4"):
-        raise InputError(f"--labels {options.labels}: unknown, choose from v3.1, v4")
+    if options.labels not in ("", *LABELS):
+        raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)
     named = {*options.cameras}
     if not named or len(named) < len(options.cameras) or named - {*ROBOT_CAMERAS}:

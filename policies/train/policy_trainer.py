@@ -34,6 +34,8 @@ WARM_STEPS = 3
 Torch's documentation of CUDA graphs asks for three; they are undone afterwards."""
 SHORTEST_WARMUP = 10
 """A training with fewer steps than its recipe warms up for one of so many."""
+LARGEST_RATIO = 1.5
+"""Largest ratio of the gradients of a compiled network and of the network: those that are right differ by 2 %."""
 HELD_BATCHES = 16
 """Most batches of held-out rows whose loss is measured."""
 
@@ -86,7 +88,7 @@ class PolicyTrainer:
         self._order = self._ordered(weights)
         names = store.pair_names
         self._sums = torch.zeros((len(names), 2), device=self.device) if len(names) > 1 else None
-        """Of each pair since the last reading: losses of its samples, and their number."""
+        """Losses of each pair's samples since the last reading, summed, and their number."""
         self.drawn = dict.fromkeys(names if len(names) > 1 else (), 0)
         """Pair → samples of this process, since the training began or went on, up to the last reading."""
         self._rows = torch.zeros(recipe.batch_size, dtype=torch.int64, device=self.device)
@@ -96,6 +98,8 @@ class PolicyTrainer:
             # Convolutions on tensor cores read channels last, in any other order each copies its input and output.
             model.policy.to(memory_format=torch.channels_last)
         self._compiled = compiled
+        self._agrees = not compiled
+        """True if the compiled networks' gradient was compared with that of the networks."""
         if compiled:
             compile_networks(model)
         self.optimizer, self._lrs = _optimizer(model, recipe, self.device)
@@ -150,6 +154,9 @@ class PolicyTrainer:
             self._frozen = self._norms_frozen
             self._graphs.clear()
             self._training_mode()
+            self._agrees = not self._compiled
+        if not self._agrees:
+            self._compare_compiled()
         if self.graphed and not self._graphs:
             self._capture()
         self._prepare(self.step)
@@ -269,6 +276,35 @@ class PolicyTrainer:
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.recipe.grad_clip)
         self._norm.copy_(norm.detach())
         self.optimizer.step()
+
+    def _compare_compiled(self) -> None:
+        """Compare the gradient of the compiled networks with that of the networks, and leave all tensors as they are.
+
+        A compiler's mistakes raise no error. Both draw other random numbers, so the norms are close, not equal.
+
+        Raises:
+            ArenaError: They differ.
+        """
+        before, norms = _copied(self.model.policy.state_dict()), []
+        for context in (uncompiled(), contextlib.nullcontext()):
+            self._prepare(self.step)
+            with context:
+                self._descend()
+            gradients = [p.grad for p in self._parameters if p.grad is not None]
+            norms.append(float(torch.nn.utils.get_total_norm(gradients)))
+        with torch.no_grad():
+            for name, tensor in self.model.policy.state_dict().items():
+                tensor.copy_(before[name])
+        if self._sums is not None:
+            self._sums.zero_()
+        self.optimizer.zero_grad(set_to_none=True)
+        own, compiled = norms
+        if not own / LARGEST_RATIO <= compiled <= own * LARGEST_RATIO:
+            raise ArenaError(
+                f"--compile: step {self.step}: the compiled network's gradient has norm {compiled:.4g}, the network's "
+                f"own {own:.4g}: torch {torch.__version__} compiles it wrongly; train without --compile"
+            )
+        self._agrees = True
 
     def _capture(self) -> None:
         """Capture a step: one graph, or two with the exchange of gradients between them.

@@ -32,7 +32,7 @@ STATE_FLOOR, ACTION_FLOOR = 1e-3, 1e-4
 POSE_FLOOR = 0.05
 """The same of poses [m, and units of sines]: the noise on what never moves must not look large."""
 LEARNING_RATE, WEIGHT_DECAY = 1e-3, 1e-4
-"""Of AdamW, in one cycle."""
+"""Rate and decay of AdamW, in one cycle."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Demonstrations:
     features: Tensor
     """float32, shape [rows, n]."""
     actions: Tensor
-    """Of v4, float32, shape [rows, 40]."""
+    """Actions of v4, float32, shape [rows, 40]."""
     lengths: tuple[int, ...]
     """Rows of each episode."""
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import counted
+from arena_newton.physics.devices import torch_device
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, vector_of
 from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe, with_pretrained
 from arena_newton.policies.train.families import families
@@ -33,7 +34,7 @@ from arena_newton.policies.train.stored_flags import plain, plain_options, resum
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
 from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
 
-__all__ = ["chosen_device", "chosen_recipe", "fast_kernels", "make_batches", "train"]
+__all__ = ["chosen_recipe", "fast_kernels", "make_batches", "train"]
 
 TOKEN_ROWS = 4096
 """Rows whose prompts are made at once."""
@@ -74,7 +75,8 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     out = options.out or default_folder(options)
     if options.resume is None:
         check_new(out)
-    device, processes = chosen_device(options.device)
+    device = torch_device(options.device)
+    processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     try:
         with _group(device, processes), fast_kernels(device):
             return _train(options, settings, out, device, processes, progress, checkpoint)
@@ -282,26 +284,6 @@ def check_pictures(datasets: list[DatasetRows], settings: TrainingRecipe) -> Non
                 f"{settings.family}/{settings.name} takes {settings.picture}x{settings.picture}: record with "
                 f"--size {settings.picture}x{settings.picture}"
             )
-
-
-def chosen_device(name: str) -> tuple[torch.device, Processes]:
-    """Device of this process, and its number among those of `torchrun`.
-
-    Raises:
-        InputError: There is no such device.
-    """
-    processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-    cuda = torch.cuda.is_available()
-    wanted = ("cuda" if cuda else "cpu") if name == "auto" else name
-    if wanted == "cpu":
-        return torch.device("cpu"), processes
-    number = wanted.removeprefix("cuda").removeprefix(":")
-    if not wanted.startswith("cuda") or (number and not number.isdigit()):
-        raise InputError(f"--device {name}: unknown, choose cpu, cuda, cuda:N or auto")
-    index = int(os.environ.get("LOCAL_RANK", "0")) if processes.count > 1 else int(number or 0)
-    if not cuda or index >= torch.cuda.device_count():
-        raise InputError(f"--device {name}: no such device, this machine has {torch.cuda.device_count()} for CUDA")
-    return torch.device("cuda", index), processes
 
 
 def default_folder(options: PolicyTrainOptions) -> Path:

@@ -7,13 +7,14 @@ import math
 import torch
 
 from arena_newton import tasks
+from arena_newton.physics.devices import torch_device
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families import families
 from arena_newton.policies.train.frames.frame_store import made_statistics
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import checkpoint_bytes
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
-from arena_newton.policies.train.training import chosen_device, chosen_recipe
+from arena_newton.policies.train.training import chosen_recipe
 
 __all__ = ["check_training"]
 
@@ -33,7 +34,7 @@ def check_training(options: PolicyTrainOptions) -> int:
     Raises:
         InputError: A flag is unfit, or something is missing.
     """
-    settings, (device, _) = chosen_recipe(options), chosen_device(options.device)
+    settings, device = chosen_recipe(options), torch_device(options.device)
     if options.compile:
         check_compiler(device)
     weights = options.weights or None

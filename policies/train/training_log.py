@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.pages.tables import csv_lines
 
 __all__ = ["COLUMNS", "LOG_FILE", "TrainingLog"]
 
@@ -69,10 +68,7 @@ class TrainingLog:
         self._bar.write(line)
 
     def _text(self, rows: list[dict[str, str]]) -> str:
-        out = io.StringIO()
-        writer = csv.DictWriter(out, self._columns, restval="", extrasaction="ignore", lineterminator=os.linesep)
-        writer.writerows(rows)
-        return out.getvalue()
+        return csv_lines([row.get(name, "") for name in self._columns] for row in rows)
 
     def close(self) -> None:
         """Write what is left; the bar stays as it is."""

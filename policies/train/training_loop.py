@@ -40,9 +40,9 @@ SKIPPED_STEPS = 10
 MEASURED_FRACTION = 0.1
 """Most of --minutes that the measurement takes, where steps are slow."""
 TIME_KEPT = 0.98
-"""Of the time that is left, what steps are planned for; the rest is for checkpoints and held-out losses."""
+"""Fraction of the time left that steps are planned for; the rest is for checkpoints and held-out losses."""
 STOP_STEPS = 20
-"""With several processes: steps between exchanges of whether one was asked to stop."""
+"""Steps between exchanges, among several processes, of whether one was asked to stop."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class TrainingProgress:
     options: Mapping[str, object] = field(default_factory=dict)
     """Flags by the names of `PolicyTrainOptions`."""
     datasets: tuple[Mapping[str, object], ...] = ()
-    """As in `CheckpointFacts`."""
+    """Datasets as in `CheckpointFacts`."""
 
     @classmethod
     def read(cls, folder: Path) -> TrainingProgress:

@@ -104,7 +104,7 @@ def test_no_drawn_colour_is_one_of_semantic_modes():
 
 
 def test_shapes_get_colours_of_the_palette_alone(batch):
-    """Of 2,000 looks of evenly lit shapes every colour that appears is one of the palette."""
+    """Every colour in 2,000 looks of evenly lit shapes is one of the palette."""
     seen, frames, chances, objects, _ = batch
     torch.manual_seed(0)
     known = set(coded(palette(CPU)).tolist())

@@ -70,6 +70,10 @@ class Chunkless(Swaying):
         return chunk
 
 
+class Mislabelled(Swaying):
+    labels = "v5"
+
+
 class Bare(Swaying):
     def act(self, observation):
         return super().act(observation).actions
@@ -203,6 +207,7 @@ class CloseOnce(Swaying):
 
 BROKEN = {
     Chunkless: ("attributes", "chunk_size is 0, expected a whole number"),
+    Mislabelled: ("attributes", "labels are 'v5', expected one of v3.1, v4 or None"),
     Bare: ("chunk", "act answers a ndarray, expected a Chunk"),
     Narrow: ("chunk", r"shape \[3, 3, 39\], expected \[3, n, 40\]"),
     Degenerate: ("chunk", "root_rot6d .* names no rotation"),
@@ -248,7 +253,7 @@ def test_each_check_finds_its_fault(broken):
 
 @pytest.mark.parametrize("cameras", [["front"], {"front": "ego"}])
 def test_cameras_are_named_configurations(cameras):
-    """Cameras that are no mapping of names to configurations are said to be that."""
+    """Cameras that are no mapping of names to configurations are reported as that."""
     policy = Swaying()
     policy.cameras = cameras
     with pytest.raises(ConformanceError, match="cameras is no mapping of names to CameraConfig"):

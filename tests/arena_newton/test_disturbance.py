@@ -14,7 +14,7 @@ LEVELS = NoiseLevels()
 
 
 def worlds(count, ticks):
-    """As much of an environment as the noise reads."""
+    """Part of an environment that the noise reads."""
     return SimpleNamespace(worlds=count, tick=np.array(ticks), torch_device=torch.device("cpu"))
 
 

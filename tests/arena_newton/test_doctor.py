@@ -5,10 +5,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import torch
 
 from arena_newton import doctor, policies, trackers
 from arena_newton.__main__ import main
 from arena_newton.cli import extras
+from arena_newton.data.readers.label_protocols import V4
 from arena_newton.files import sandboxed_load
 from arena_newton.robot.canonical import STAND_ACTION
 
@@ -22,7 +24,7 @@ def found(findings, subject):
 
 
 def test_modules_are_tried_in_another_process(tmp_path, monkeypatch):
-    """A module that imports has no fault; one that does not, crashes or hangs is told, in their order."""
+    """A module that imports has no fault; one that does not, crashes or hangs is reported, in their order."""
     (tmp_path / "dies_at_once.py").write_text("import os\nos.abort()\n")
     (tmp_path / "never_ends.py").write_text("import time\ntime.sleep(100)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -105,9 +107,22 @@ class Rash(policies.Policy):
         return policies.Chunk(STAND_ACTION[None])
 
 
+class Turns(policies.Policy):
+    """Turns on the spot by labels of v4, which are no actions of v3.1."""
+
+    name, labels = "turns", "v4"
+
+    def act(self, observation):
+        actions = torch.zeros(len(observation.state), 1, 40)
+        actions[..., V4["root_z"]], actions[..., V4["yaw_rate"]] = 0.8, 0.5
+        return policies.Chunk(actions)
+
+
 def test_a_policy_by_name(capsys):
-    """A policy that conforms is 0, one that does not is 1; one that reads the world is tried in worlds."""
+    """A policy that conforms in its own labels is 0, one that does not is 1; one that reads the world is given one."""
     policies.register("rash", lambda argument: Rash())
+    policies.register("turns", lambda argument: Turns())
+    assert main(["doctor", "--policy", "turns"]) == 0
     assert main(["doctor", "--policy", "stand"]) == 0
     assert main(["doctor", "--policy", "expert", "--task", "boxing", "--seeds", "3", "4"]) == 0
     assert "not tried in real worlds" in capsys.readouterr().out

@@ -197,7 +197,7 @@ def test_the_estimate_is_the_exact_gradient_where_both_exist():
 
 
 def test_a_fallen_world_reaches_nothing_more():
-    """From the tick of a fall or an error on, a world's margin is −inf, whatever its bodies do."""
+    """A world's margin is −inf from the tick of a fall or an error on, whatever its bodies do."""
     env = ArenaEnv("vis_navi", tracker=trackers.get("pd"), worlds=2, engine="mujoco", device="cpu", rules="released")
     actions = torch.tensor(canonical.STAND_ACTION).repeat(2, 6, 1)
     actions[1, 3] = torch.nan

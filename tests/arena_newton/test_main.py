@@ -40,10 +40,6 @@ def test_every_program_of_the_package_has_a_command():
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)
 def test_every_command_explains_itself(command, capsys):
     """`--help` behind each command's words is the command's own and ends with 0."""
-    if command.words == "rules":
-        assert main(["rules"]) == 0 and "| `paper` | `released` |" in capsys.readouterr().out
-        assert main(["rules", "--help"]) == 0 and "takes no arguments" in capsys.readouterr().out
-        return
     try:
         code = main([*command.words.split(), "--help"])
     except SystemExit as stop:  # of argparse and tyro
@@ -85,10 +81,10 @@ def test_arguments_and_exit_codes_pass(tmp_path, capsys):
 
 def test_what_is_no_command_is_named(capsys):
     """Unknown words and surplus arguments are one line and 2; groups and nothing at all show the overview."""
-    for arguments in (["evl"], ["trackers", "nothing"], ["evl", "--help"], ["rules", "x"], ["doctor", "--x"]):
+    for arguments in (["evl"], ["trackers", "nothing"], ["evl", "--help"], ["rules", "--x"], ["doctor", "--x"]):
         assert main(arguments) == 2
         error = capsys.readouterr().err
-        assert error.startswith("error: ") and error.count("\n") == 1 and arguments[0] in error
+        assert error.startswith("error: ") and error.count("\n") == 1 and any(word in error for word in arguments)
     assert main([]) == main(["trackers"]) == 2
     shown = capsys.readouterr()
     assert not shown.out and all(shown.err.count(f"arena-newton {c.words} ") for c in COMMANDS)

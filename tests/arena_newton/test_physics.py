@@ -6,10 +6,12 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from arena_newton.errors import InputError
 from arena_newton.physics import scene as scene_file
+from arena_newton.physics.devices import torch_device
 from arena_newton.physics.engines import make_physics, resolve_engine
 from arena_newton.physics.scene import load_scene
 from arena_newton.robot.g1 import DEFAULT_POSE, SONIC_DRIVE, PhysicsRate
@@ -317,7 +319,7 @@ over "World"
 
 
 def test_a_scene_is_the_same_however_often_it_was_built(monkeypatch):
-    """From an import that is kept, with other drives in between, MuJoCo's model is that of the first, byte for byte."""
+    """MuJoCo's model from a kept import, with other drives in between, is that of the first, byte for byte."""
     monkeypatch.setattr(scene_file, "_OWN", {})
 
     def model(**options):
@@ -357,3 +359,14 @@ def test_bad_engine_or_device_is_named(engine, device, named):
     """An unknown engine or a missing device gives one error that names the flag."""
     with pytest.raises(InputError, match=named):
         resolve_engine(engine, device)
+
+
+def test_each_process_of_torchrun_has_a_gpu_of_its_own(monkeypatch):
+    """Without a name the best device is taken, and one that is not there is refused."""
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert [str(torch_device(name)) for name in (None, "cpu", "cuda:1")] == ["cuda:0", "cpu", "cuda:1"]
+    with pytest.raises(InputError, match="--device cuda:2: no such device, this machine has 2"):
+        torch_device("cuda:2")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert [str(torch_device(name)) for name in ("auto", "cpu", "cuda")] == ["cuda:1", "cpu", "cuda:1"]

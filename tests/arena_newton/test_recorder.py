@@ -152,7 +152,7 @@ def test_sizes_and_text_of_videos(env, tmp_path):
 
 
 def test_follow_camera_keeps_the_robot_large(env, tmp_path):
-    """From the following camera the robot is at least half as high as the picture, wherever it is in the room."""
+    """The robot is at least half as high as the following camera's picture, wherever it is in the room."""
     camera = Camera(
         env.scene.model,
         np.array([-1]),

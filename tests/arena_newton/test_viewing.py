@@ -25,7 +25,7 @@ WORLDS, TICKS = 2, 10
 
 @dataclass
 class Episode:
-    """As much of a planned episode as a file name needs."""
+    """Part of a planned episode that a file name needs."""
 
     repeat: int
     task: str = "football"

@@ -42,7 +42,7 @@ class _Programs:
 
 
 def test_whole_commands_are_compared(tmp_path, monkeypatch):
-    """By turns, ratio per round; the time of playing and successes are named, and the CPU's ratio is information."""
+    """Rounds take turns, with a ratio each; time and successes are named, and the CPU's ratio is information."""
     programs = _Programs(monkeypatch, [2.0, 8.0, 2.0, 12.0, 4.0, 12.0], [3.0, 4.0, 9.0])
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: False)
     history = tmp_path / "history.jsonl"

@@ -185,7 +185,7 @@ class ManagerBasedRlEnv:
     "utils/torch.py": "def configure_torch_backends():\n    pass\n",
     "../mjlab-1.6.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: mjlab\nVersion: 1.6.0\n",
 }
-"""What the script uses of mjlab, which is not installed beside this product."""
+"""Parts of mjlab that the script uses, which is not installed beside this product."""
 
 
 def test_the_script_that_mjlab_is_handed(tmp_path):

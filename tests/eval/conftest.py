@@ -62,7 +62,7 @@ class Keepers(defaultdict):
     """Builder of environments (`Factories.env`) that hands out again what was closed: one keeper for each kind."""
 
     def __call__(self, task, **options):
-        """The environment of a run; what is not said is the default."""
+        """The environment of a run; what is not given is the default."""
         said = {name: value for name, value in options.items() if value is not None and value is not False}
         said = {"rules": "paper", "mode": "base"} | said
         kind = {name: str(value) for name, value in sorted(said.items()) if name != "tracker"}

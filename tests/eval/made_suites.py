@@ -2,8 +2,8 @@
 
 import json
 
+from made_folders import document_of
 from rows import full, record
-from test_report import document_of
 
 from arena_newton import tasks
 from arena_newton.eval.records.document import SUITE_FILE

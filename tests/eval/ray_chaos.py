@@ -16,8 +16,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from made_folders import contents
 from ray_nodes import Nodes
-from test_shard_merge import contents
 
 from arena_newton.eval.workers.shard_merge import merge
 

@@ -16,7 +16,7 @@ class WatchedEnv(ArenaEnv):
     """Keeps, by episode seed, a hash of the physical state and the observed 64 numbers after every tick."""
 
     history: dict[int, list[str]] = {}
-    """Of all watched worlds since it was last cleared."""
+    """Hashes of all watched worlds since it was last cleared."""
 
     def reset(self, seeds, worlds=None, *, spawn=None):
         super().reset(seeds, worlds, spawn=spawn)

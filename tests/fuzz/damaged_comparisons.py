@@ -16,9 +16,9 @@ def comparisons(
 ) -> tuple[Callable[[Path], None], Callable[[], tuple[str, bytes]]]:
     """A results folder and a suite that are compared, one file of which is damaged; half the faults keep its JSON."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "eval"))
+    from made_folders import folder_with
     from made_suites import cell_of, outcomes, write_suite
     from rows import episodes
-    from test_report import folder_with
 
     from arena_newton.eval.__main__ import main
 

@@ -11,7 +11,7 @@ from tests.fuzz.mutants import READERS
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("reader", READERS)
 def test_damaged_files(reader, mutants, tmp_path):
-    """Of many damaged files none crashes its reader, takes 1 GiB, or is answered by anything but one line."""
+    """None of many damaged files crashes its reader, takes 1 GiB, or is answered by anything but one line."""
     process = Child("tests.fuzz.mutants", [reader, str(mutants), str(tmp_path)])
     said, complained = process.communicate(300)
     assert process.returncode == 0, f"{reader}: ended with {process.returncode}: {complained[-2000:]}"

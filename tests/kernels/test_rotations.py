@@ -115,7 +115,7 @@ def test_rot6d_is_row_layout(device, twin):
 
 
 def test_rot6d_decodes_by_gram_schmidt(device, twin):
-    """Noisy, scaled rot6d decode to the rotation of a QR decomposition, half turns too; degenerate ones are told."""
+    """Noisy, scaled rot6d decode to the rotation of a QR decomposition, half turns too; degenerate ones are flagged."""
     rng = np.random.default_rng(2)
     quat = twin.random_quats(rng, 400)
     quat[:4] = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0]]

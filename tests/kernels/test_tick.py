@@ -40,7 +40,7 @@ def test_only_masked_worlds_reach_the_actuators(device, fingers):
 
 
 def test_status_has_one_order(device):
-    """Of everything that may hold at once, errors win over success, success over a fall, a fall over events."""
+    """Errors win, of all that may hold at once, over success, success over a fall, a fall over events."""
     flags = np.array(list(itertools.product([0, 1], repeat=6)), np.int32)
     success, fallen, event, state, action, targets = flags.T
     status = _ints(np.full(len(flags), 99), device)

@@ -51,7 +51,7 @@ def test_two_episodes_end_in_the_crate(played):
 
 
 def test_the_free_wrist_shows_the_time_of_a_grasp(env, played):
-    """From hover to lift the right wrist rolls on with every decision, to its end; before that it rests."""
+    """The right wrist rolls on with every decision from hover to lift, to its end; before that it rests."""
     results, actions, _ = played
     column = ACTION["joint_pos"].start + CANONICAL_JOINTS.index("right_wrist_roll_joint")
     for episode, result in zip(episodes(env, *EPISODES, group=SEED), results, strict=True):
@@ -99,7 +99,7 @@ def test_pace_ends_with_the_feet_together(expert):
 
 
 def test_a_lift_without_the_hammer_is_repeated(expert):
-    """When the hand comes up empty, the hand opens and the robot steps in again; rows outside the mask stay."""
+    """A hand that comes up empty opens and the robot steps in again; rows outside the mask stay."""
     machine, everyone = expert.machine, torch.ones(2, dtype=torch.bool)
     machine.enter("lift", everyone)
     machine.advance(everyone, LONGEST["lift"])

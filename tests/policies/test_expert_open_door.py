@@ -141,7 +141,7 @@ def test_it_goes_on_while_it_still_walks(door):
 
 
 def test_the_hand_never_pauses_at_the_lever(door):
-    """From `lower` until the press has reached its end the commanded palm sinks with every decision."""
+    """The commanded palm sinks with every decision from `lower` until the press has reached its end."""
     sight, expert = door
     at_the_lever(sight, expert)
     sight.hands[:, 1] = sight.at((PIVOT[0] - ON_LEVER, PIVOT[1]), 0.95 + TOUCHING)

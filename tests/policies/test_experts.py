@@ -77,7 +77,7 @@ def test_a_way_keeps_its_clearance():
 
 
 def test_a_closed_wall_has_no_way():
-    """Behind a wall across the room there is no way, and that is said."""
+    """Behind a wall across the room there is no path, and that is reported."""
     wall = torch.tensor([[[0.0, 0.0, 0.0, 5.0, 0.1]]])
     ways = plan(torch.tensor([[0.0, -2.0]]), torch.tensor([[0.0, 2.0]]), Floor(wall, (-3.0, -3.0), (3.0, 3.0)))
     assert float(ways.length) >= BLOCKED and float(ways.clearance) == 0.0

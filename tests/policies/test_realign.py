@@ -132,7 +132,7 @@ def test_a_loop_with_drift_stays_near_the_robot(length):
 
 @pytest.mark.parametrize("late", [0, 5, 15])
 def test_a_look_is_compared_with_the_heading_of_its_own_tick(late):
-    """A robot that is where it was told to be has no gap, however many ticks before its chunk the policy looks."""
+    """A robot at its commanded pose has no gap, however many ticks before its chunk the policy looks."""
     policy = V4Policy(Turning(0.5, 20, RATE), late)
     policy.reset([0], ["boxing"])
     commanded = [0.0] * (late + 1)  # it stands until the first chunk begins

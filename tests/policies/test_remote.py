@@ -234,7 +234,7 @@ def test_failed_reset_ends_its_world(server, policy):
 
 
 def test_nobody_there(server):
-    """An address where nobody listens is told before the first episode, and stops a run that is under way."""
+    """An address where nobody listens is reported before the first episode, and stops a run that is under way."""
     server.shutdown()
     server.server_close()
     policy = RemotePolicy(server.url, timeout=2.0, retries=1, backoff=0.01)
@@ -314,7 +314,7 @@ def test_kept_connections_that_the_server_closed(server):
 
 @pytest.mark.parametrize("sequential", [False, True])
 def test_server_that_dies_in_a_batch_stops_the_run(server, sequential):
-    """When the server dies while it answers a batch, no world of it is called an error."""
+    """A server's death while it answers a batch is no world's error."""
     policy = RemotePolicy(server.url, timeout=2.0, retries=1, backoff=0.01, sequential=sequential)
     assert policy.act(observation(4)).errors == {}
     server.behave = {1.0: "dies"}
@@ -382,7 +382,7 @@ def test_failures_in_a_row(server, policy):
     ],
 )
 def test_check_refuses_what_is_no_policy_server(answer, text):
-    """Something else at the address is told before the first episode."""
+    """Something else at the address is reported before the first episode."""
 
     def serve(listening):
         while True:

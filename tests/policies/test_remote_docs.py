@@ -117,9 +117,12 @@ def test_request_tables():
     assert list(picture) == ["shape", "dtype", "data_b64"]
 
 
-def test_server_of_the_text():
-    """The server is the file that it names, and its noise follows from seed and step alone."""
+def test_server_of_the_text(monkeypatch):
+    """The server is the file that it names, explains itself, and its noise follows from seed and step alone."""
     assert (ROOT / "policies" / "serve_example.py").read_text().endswith(BLOCKS[0])
+    monkeypatch.setattr("sys.argv", ["serve_example", "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        exec(compile(BLOCKS[0], "docs/policies.md", "exec"), {"__name__": "__main__"})
     names = {"__name__": "server"}
     exec(compile(BLOCKS[0], "docs/policies.md", "exec"), names)
     names["Handler"].log_message = lambda *_: None

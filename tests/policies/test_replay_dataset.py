@@ -90,7 +90,7 @@ def test_each_episode_finds_its_own_recording(played, tmp_path):
 
 
 def test_the_same_seed_through_two_trackers(played, standing, tmp_path):
-    """Of recordings through several trackers that of the environment's is played."""
+    """The recording through the environment's tracker, of several, is played."""
     env, episodes, _, _ = played
     seed = episodes[0].episode_seed
     info = arena([seed, seed])

@@ -359,7 +359,7 @@ def test_figures_have_the_verdict_of_their_bar():
 
 
 def test_a_part_of_the_suite_has_no_verdict_on_falls():
-    """The bar of the fall rate holds for the whole suite; of some cells it is told without a verdict."""
+    """The bar of the fall rate holds for the whole suite; of some cells it is given without a verdict."""
     some = _result("ours", "twist2", False, 0, suite("quick"))
     official = _result("official", "twist2", True, 2, suite("quick"))
     verdicts = {f.name: f.verdict for f in figures(some, [some, official])}

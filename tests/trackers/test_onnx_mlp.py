@@ -113,7 +113,7 @@ def tracking_export(path, *, timed=False):
 
 
 def test_a_training_programs_export_is_read(tmp_path):
-    """Of an export with a time step and its motion both readers run the network from first input to first output."""
+    """Both readers of an export with a time step and its motion run the network from first input to first output."""
     path = tracking_export(tmp_path / "a.onnx")
     x = torch.randn(3, 154)
     options = onnxruntime.SessionOptions()

@@ -155,7 +155,7 @@ def test_unfit_files(files, tmp_path, name):
 
 
 def test_foreign_files(files, tmp_path):
-    """Noise, a stranger's safetensors, and the other interface's weights are told apart."""
+    """Noise, a stranger's safetensors, and the other interface's weights are distinguished."""
     noise = tmp_path / "noise.safetensors"
     for data in (b"", b"\x00" * 7, b"\xff" * 64, b"x" * 5000):
         noise.write_bytes(data)

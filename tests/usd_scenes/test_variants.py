@@ -147,7 +147,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("case", CHANGES)
 def test_changes_are_told(written, case):
-    """Gravity, robot, rule markers, masses and colliders that differ are told in sentences; looks are free."""
+    """Gravity, robot, rule markers, masses and colliders that differ are reported in sentences; looks are free."""
     body, sentences = CHANGES[case]
     path = written(body)
     if case == "own variant":
@@ -195,7 +195,7 @@ FILTERS = {
 
 @pytest.mark.parametrize("case", FILTERS)
 def test_lost_collisions_are_told_and_refused(written, case, once):
-    """Whatever keeps robot, ground and rule objects from meeting is told as a change and named by `validate`."""
+    """Whatever keeps robot, ground and rule objects from meeting is reported as a change and named by `validate`."""
     body, told, *faults = FILTERS[case]
     path = written(body)
     effects = [text for text in differences(path, "football") if "no longer meet" in text]
@@ -216,7 +216,7 @@ def test_bodies_that_do_not_move_are_refused(written, line):
 
 
 def test_collisions_that_stay_are_no_fault(written, once):
-    """A collision group that filters nothing that the task needs is accepted, and the new group is told."""
+    """A collision group that filters nothing that the task needs is accepted, and the new group is reported."""
     path = written(GROUP.format("rel collection:colliders:includes = </World/Ball>"))
     assert validate(path) == []
     assert differences(path, "football") == ["collisions: /World/G is a new collision group"]
@@ -257,7 +257,7 @@ def test_a_larger_ball_starts_on_the_floor(written):
 
 
 def test_a_ball_that_is_drawn_smaller_than_it_collides_is_named(written, monkeypatch):
-    """Another radius alone leaves the drawn ball as it is, and that is said; with the mesh scaled too it is not."""
+    """Another radius alone leaves the drawn ball as it is, and that is reported; with the mesh scaled too it is not."""
     own = "arena_newton.usd_scenes.differences.compiled"  # of the models nothing is asked here
     monkeypatch.setattr(own, lambda path, variant: own_compiled("football", variant))
     path = written(over("double radius = 0.15", "Ball", "Collider"))

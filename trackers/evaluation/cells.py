@@ -19,7 +19,7 @@ GOAL_SECONDS = 26.0
 GOAL_RANGE = 3.0
 """Goals are within this on either axis [m]."""
 RIGHT_FOOT = -0.11
-"""To the left of the robot's middle [m]: in front of the right foot."""
+"""Offset to the left of the robot's middle [m]: in front of the right foot."""
 SEAT_DEPTH, SEAT_GAP = 0.5, 0.05
 """Depth of the seat, and its front edge behind the standing pelvis [m] (measured: at 18 cm the robot misses it)."""
 QUICK = ("stand", "walk 0.3", "walk 0.6", "turn 0.5", "squat 0.45", "kick 2.5", "sit 0.42", "push 40 N·s, walk 0.3")

@@ -44,7 +44,7 @@ class Ball:
     distance: tuple[float, float]
     """Least and largest distance in front of the ankles [m]."""
     lateral: float
-    """To the left of the robot's middle [m]."""
+    """Offset to the left of the robot's middle [m]."""
     spread: float = 0.01
     """Uniform error of the lateral position [m]."""
 
@@ -93,7 +93,7 @@ class Cell:
     """A goal instead."""
     friction: float = 1.0
     payload: float = 0.0
-    """In each hand [kg]."""
+    """Mass in each hand [kg]."""
     support: Placed | None = None
     ball: Ball | None = None
     push: Push | None = None

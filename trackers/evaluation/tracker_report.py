@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.cli.intervals import wilson
-from arena_newton.pages.tables import Table
+from arena_newton.pages.tables import Table, csv_lines
 from arena_newton.trackers.evaluation.figures import Figure, Result, figures
 
 __all__ = ["COLUMNS", "cell_rows", "document", "figure_table", "markdown", "write"]
@@ -162,8 +161,6 @@ def write(results: Sequence[Result], options: dict[str, Any], out: Path) -> list
     paths[1].write_text(json.dumps(document(results, options), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     entries = [entry for result in results for entry in cell_rows(result)]
     names = list(dict.fromkeys(name for entry in entries for name in entry))
-    with paths[2].open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(entries)
+    rows = [[entry.get(name, "") for name in names] for entry in entries]
+    paths[2].write_text(csv_lines([names, *rows], "\r\n"), encoding="utf-8", newline="")
     return paths

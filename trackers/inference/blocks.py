@@ -55,7 +55,7 @@ class OnnxProduct:
     """A network in ONNX Runtime: rows in, rows out."""
 
     def __init__(self, session: onnxruntime.InferenceSession):
-        """Of a session with one input, `obs`, and one output, `action`."""
+        """Make one of a session with one input, `obs`, and one output, `action`."""
         self._session = session
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""From where the robot is and where it should be to a planar velocity command, batched over worlds.
+"""Planar velocity command that leads the robot from its pose to a goal, batched over worlds.
 
 The controller is proportional with a slow-down at the goal, and stands still once it has arrived: a tracker that cannot
 see position (TWIST2, SONIC) needs this loop around it, and every correction of a few centimetres costs two steps.
@@ -69,7 +69,7 @@ class NavigationCommand:
     velocity: Tensor
     """vx, vy [m/s], yaw rate [rad/s] in the heading frame, [worlds, 3]; zero where the robot holds."""
     arrived: Tensor
-    """At the goal and holding, bool, [worlds]."""
+    """True at the goal and holding, bool, [worlds]."""
     distance: Tensor
     """Path left [m], [worlds]."""
     heading_error: Tensor

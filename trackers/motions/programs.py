@@ -311,7 +311,7 @@ def _seated(d: _Draw, lead: Script, seconds: float) -> _Plan:
 
 @_family(224)
 def _sit(d: _Draw, seconds: float) -> _Plan:
-    """From standing onto a seat; see `_seated`."""
+    """Plan from standing onto a seat; see `_seated`."""
     return _seated(d, p.stand(d(0.3, 1.5)), seconds)
 
 

@@ -24,7 +24,7 @@ TARGET_HEIGHT = 0.68
 EYE = (1.1, -2.6, 0.35)
 """Eye from there [m]: from the robot's right, a little ahead."""
 LIGHT_DIRECTION = (-0.35, 0.45, -1.0)
-"""From the light to the scene; its shadows show whether a foot is on the floor."""
+"""Direction from the light to the scene; its shadows show whether a foot is on the floor."""
 LIGHT_INTENSITY = 4000.0
 _FIXTURE = {kind: f"/World/{name}" for kind, name in zip(SUPPORTS[1:], FIXTURES, strict=True)}
 """Support → the lab's prim of it."""

@@ -1,4 +1,4 @@
-"""From a training checkpoint to the weights file of a tracker and its card."""
+"""Export of a training checkpoint to the weights file of a tracker and its card."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from arena_newton.errors import InputError
+from arena_newton.files.limits import TEXT_BYTES
 from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.stored_json import read_object
 from arena_newton.pages.tables import Table
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
@@ -97,16 +99,14 @@ def _figures(path: Path, interface: str) -> dict[str, Any]:
     Raises:
         InputError: The file is no evaluation of such a tracker.
     """
+    document = read_object(path, TEXT_BYTES)
     try:
-        document = json.loads(path.read_text())
         measured = next(t for t in document["trackers"] if t["name"] == interface)
         figures = [{key: str(f[key]) for key in ("name", "bar", "value", "verdict")} for f in measured["figures"]]
         settings = dict(document["options"])
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"--metrics {path}: not a readable JSON file ({type(error).__name__})") from error
     except StopIteration:
         raise InputError(f"--metrics {path}: an evaluation of other trackers than {interface}") from None
-    except (KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, ValueError):
         raise InputError(f"--metrics {path}: not an evaluation.json of trackers.evaluate") from None
     kept = ("suite", "rollouts", "seed", "engine", "device", "clips", "only")
     return {"figures": figures, "settings": {k: settings[k] for k in kept if settings.get(k) not in (None, "")}}

@@ -70,7 +70,7 @@ class TrackerPPO(PPO):
         return iteration
 
     def _fit_optimizer(self) -> None:
-        """On CUDA the optimiser keeps its rate and its counts on the device, so that a graph can hold a step."""
+        """Keep the optimiser's rate and counts on the device, on CUDA, so that a graph can hold a step."""
         self.captured = None
         on_cuda = self.stream is not None
         for group in self.optimizer.param_groups:
@@ -210,13 +210,13 @@ class _Captured:
         self._step = captured(ppo.step, "update-graph", ppo.stream)
 
     def gradients(self, batch: RolloutStorage.Batch) -> torch.Tensor:
-        """As `TrackerPPO.gradients`; the result's buffer is reused by the next call."""
+        """Gradients as of `TrackerPPO.gradients`; the result's buffer is reused by the next call."""
         torch._foreach_copy_(self._inputs, _tensors(batch))
         self._gradients.replay()
         return self._losses
 
     def step(self) -> None:
-        """As `TrackerPPO.step`."""
+        """Step as `TrackerPPO.step` does."""
         self._step.replay()
 
 

@@ -117,7 +117,7 @@ class TrackerRunner(OnPolicyRunner):
         self._resumed: Path | None = None
 
     def _configure_multi_gpu(self) -> None:
-        """As rsl_rl, which knows GPUs only; processes on the CPU talk through gloo."""
+        """Configure as rsl_rl does, which knows GPUs only; processes on the CPU talk through gloo."""
         processes = int(os.environ.get("WORLD_SIZE", "1"))
         if processes == 1 or self.device != "cpu":
             super()._configure_multi_gpu()
@@ -285,7 +285,7 @@ class TrackerRunner(OnPolicyRunner):
 
     def anneal(self, elapsed: float) -> None:
         """Reduce target KL and entropy coefficient towards the end of a time limit; see `annealed`."""
-        left = annealed(elapsed, self.options.settle)
+        left = annealed(elapsed, self.options.anneal)
         self.alg.desired_kl = self.options.desired_kl * left
         self.alg.entropy_coef = self.options.entropy * left
 

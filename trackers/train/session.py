@@ -20,6 +20,7 @@ import torch
 
 from arena_newton.cli.flags import shell_command
 from arena_newton.errors import InputError, naming
+from arena_newton.physics.devices import torch_device
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.interface import get
 from arena_newton.trackers.motions import programs
@@ -162,19 +163,9 @@ def _checkpoint(options: TrainOptions) -> tuple[Checkpoint | None, str]:
     return checkpoint, kind
 
 
-def _device(name: str) -> str:
-    if name != "cpu" and "LOCAL_RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        name = f"cuda:{os.environ['LOCAL_RANK']}"
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
-        raise InputError(f"--device {name}: no such device here")
-    return "cuda:0" if name == "cuda" else name
-
-
 def _with_worlds(options: TrainOptions) -> TrainOptions:
     """Options that name a number of worlds."""
-    usual = CPU_WORLDS if _device(options.device) == "cpu" else GPU_WORLDS
+    usual = CPU_WORLDS if torch_device(options.device).type == "cpu" else GPU_WORLDS
     return options if options.worlds else dataclasses.replace(options, worlds=usual)
 
 
@@ -191,7 +182,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     rewards = configured(options.rewards, options.reward_scales)
     with naming("--tracker"):
         interface = get(options.tracker)
-    device = _device(options.device)
+    device = str(torch_device(options.device))
     checkpoint, kind = _checkpoint(options)
     form = interface.action_form(kind)
     if not options.bench:

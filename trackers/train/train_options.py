@@ -5,16 +5,13 @@ This module loads nothing heavy: `--help` answers at once.
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from arena_newton.cli.flags import Several, flag_name
+from arena_newton.cli.flags import Device, Several, bounds, check_bounds, check_number
 from arena_newton.errors import InputError
 from arena_newton.trackers.interface import names
 
@@ -43,31 +40,20 @@ GPU_WORLDS, CPU_WORLDS = 8192, 16
 """Worlds where none are named: what fills a GPU, and what a CPU trains an iteration of in seconds."""
 
 
-def within(low: float, high: float) -> dict[str, tuple[float, float]]:
-    """Metadata of an option whose number, or each of whose numbers, is within these bounds."""
-    return {"bounds": (low, high)}
-
-
-def at_least(low: float) -> dict[str, tuple[float, float]]:
-    """Metadata of an option whose number, or each of whose numbers, is finite and at least `low`."""
-    return within(low, math.inf)
-
-
 @dataclass(frozen=True)
 class TrainOptions:
-    """Train a tracker with PPO in the lab world."""
+    """Train a tracker with PPO in the lab world; with torchrun each process takes a GPU of its own."""
 
     tracker: TrackerName = "twist2"
     """Interface to train."""
-    worlds: int = field(default=0, metadata=at_least(0))
+    worlds: int = field(default=0, metadata=bounds(0))
     """Parallel worlds of each process, 0 = 8192 on a GPU, 16 on a CPU."""
-    device: str = "auto"
-    """cpu, cuda or cuda:N; with torchrun each process takes its own GPU."""
-    minutes: float = field(default=0.0, metadata=at_least(0))
+    device: Device[str] = "auto"
+    minutes: float = field(default=0.0, metadata=bounds(0))
     """Time limit [min], 0 = none."""
-    iterations: int = field(default=100000, metadata=at_least(1))
+    iterations: int = field(default=100000, metadata=bounds(1))
     """Largest number of iterations of this call."""
-    seed: int = field(default=0, metadata=within(0, 2**31))
+    seed: int = field(default=0, metadata=bounds(0, 2**31))
     """Seed; each process of torchrun adds its rank."""
     resume: Path | None = None
     """Checkpoint of a training to continue."""
@@ -75,7 +61,7 @@ class TrainOptions:
     """Weights file (.safetensors) with the initial network of a new training."""
     library: Path | None = None
     """Motion library (NPZ); without it, references are generated."""
-    families: dict[str, int] = field(default_factory=dict, metadata=at_least(1))
+    families: dict[str, int] = field(default_factory=dict, metadata=bounds(1))
     """Number of generated clips per family, e.g. `--families walk 900 squat 200`; the generator's mix by default."""
     clips: Several[Path] = ()
     """Further motion files of any format that `motions convert` reads."""
@@ -85,7 +71,7 @@ class TrainOptions:
     """Origin of those files, for the card."""
     mirror: bool = True
     """Add the mirror image of every clip."""
-    family_weights: dict[str, float] = field(default_factory=dict, metadata=at_least(0))
+    family_weights: dict[str, float] = field(default_factory=dict, metadata=bounds(0))
     """Sampling weights of families per second of motion; by default 40 for `clips`, 1 for the others."""
     log_dir: Path = Path("runs/tracker")
     """Folder for checkpoints, progress.jsonl and TensorBoard."""
@@ -93,47 +79,48 @@ class TrainOptions:
     """Service that shows the curves."""
     action_form: Literal["auto", "residual", "default"] = "auto"
     """Raw actions are offsets from the reference (residual, auto) or from a default pose."""
-    rewards: dict[str, float] = field(default_factory=dict, metadata=within(-1e6, 1e6))
+    rewards: dict[str, float] = field(default_factory=dict, metadata=bounds(-1e6, 1e6))
     """Weights of reward terms by name, where not those of the table, e.g. `--rewards heading 1.0`."""
-    reward_scales: dict[str, float] = field(default_factory=dict, metadata=within(1e-6, 1e6))
+    reward_scales: dict[str, float] = field(default_factory=dict, metadata=bounds(1e-6, 1e6))
     """Scales of tracking rewards exp(-error² / scale²) by name, e.g. `--reward-scales legs 0.1`."""
     randomise: bool = True
     """Domain randomisation, observation noise and pushes."""
-    adaptive: float = field(default=0.25, metadata=within(0, 1))
+    adaptive: float = field(default=0.25, metadata=bounds(0, 1))
     """Fraction of the episodes that start where the tracker fails."""
-    episode_s: float = field(default=10.0, metadata=within(0.1, 3600))
+    episode_s: float = field(default=10.0, metadata=bounds(0.1, 3600))
     """Maximum length of an episode [s]."""
-    steps: int = field(default=16, metadata=at_least(2))
+    steps: int = field(default=16, metadata=bounds(2))
     """Ticks per iteration."""
-    epochs: int = field(default=5, metadata=at_least(1))
+    epochs: int = field(default=5, metadata=bounds(1))
     """Passes over the samples of an iteration."""
     minibatches: int = 4
     """Minibatches per pass."""
-    learning_rate: float = field(default=3e-4, metadata=within(1e-8, 1))
+    learning_rate: float = field(default=3e-4, metadata=bounds(1e-8, 1))
     """Initial learning rate."""
-    desired_kl: float = field(default=0.02, metadata=within(1e-6, 10))
+    desired_kl: float = field(default=0.02, metadata=bounds(1e-6, 10))
     """Target KL divergence per iteration (adaptive learning rate)."""
-    entropy: float = field(default=0.0015, metadata=at_least(0))
+    entropy: float = field(default=0.0015, metadata=bounds(0))
     """Entropy coefficient."""
-    settle: float = field(default=0.0, metadata=within(0, 1))
+    # `--settle` in the commands of earlier cards.
+    anneal: Annotated[float, tyro.conf.arg(aliases=("--settle",))] = field(default=0.0, metadata=bounds(0, 1))
     """Final fraction of `--minutes` over which target KL and entropy coefficient are annealed to 10 %."""
-    init_std: float = field(default=0.5, metadata=within(1e-3, 10))
+    init_std: float = field(default=0.5, metadata=bounds(1e-3, 10))
     """Initial standard deviation of the action noise."""
-    mirror_loss: float = field(default=0.0, metadata=at_least(0))
+    mirror_loss: float = field(default=0.0, metadata=bounds(0))
     """Weight of the squared difference between the action of a mirrored observation and the mirrored action."""
-    save_interval: int = field(default=200, metadata=at_least(1))
+    save_interval: int = field(default=200, metadata=bounds(1))
     """Iterations between checkpoints."""
-    keep_last: int = field(default=3, metadata=at_least(0))
+    keep_last: int = field(default=3, metadata=bounds(0))
     """Number of latest checkpoints that are kept, 0 = all."""
-    keep_every: int = field(default=10, metadata=at_least(0))
-    """Of the older ones every n-th is kept, 0 = none."""
-    print_interval: int = field(default=20, metadata=at_least(1))
+    keep_every: int = field(default=10, metadata=bounds(0))
+    """Interval of the older ones that are kept: every n-th, 0 = none."""
+    print_interval: int = field(default=20, metadata=bounds(1))
     """Iterations between printed lines."""
-    log_interval: int = field(default=5, metadata=at_least(1))
+    log_interval: int = field(default=5, metadata=bounds(1))
     """Iterations between points of the curves."""
-    contacts_per_world: int = field(default=48, metadata=at_least(1))
+    contacts_per_world: int = field(default=48, metadata=bounds(1))
     """Size of the contact buffer."""
-    constraints_per_world: int = field(default=160, metadata=at_least(1))
+    constraints_per_world: int = field(default=160, metadata=bounds(1))
     """Size of the constraint buffer."""
     graph: bool = True
     """Capture the physics of a tick in a CUDA graph."""
@@ -190,12 +177,10 @@ def check(options: TrainOptions) -> None:
     Raises:
         InputError: A flag's number is out of range.
     """
-    for option in dataclasses.fields(options):
-        if "bounds" in option.metadata:
-            _refuse_outside(flag_name(option.name), getattr(options, option.name), *option.metadata["bounds"])
-    _refuse_outside("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
-    if options.settle > 0.0 and options.minutes <= 0.0:
-        raise InputError(f"--settle {options.settle}: a fraction of --minutes, which is not given")
+    check_bounds(options)
+    check_number("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
+    if options.anneal > 0.0 and options.minutes <= 0.0:
+        raise InputError(f"--anneal {options.anneal}: a fraction of --minutes, which is not given")
     if options.resume is not None and options.start_from is not None:
         raise InputError("--resume continues a training, --start-from begins one: pass one of the two")
     if options.library is not None and options.families:
@@ -203,15 +188,6 @@ def check(options: TrainOptions) -> None:
     for flag, file in (("--resume", options.resume), ("--start-from", options.start_from)):
         if file is not None and not file.is_file():
             raise InputError(f"{flag} {file}: {'is a folder, expected a file' if file.is_dir() else 'no such file'}")
-
-
-def _refuse_outside(flag: str, value: float | Mapping[str, float], low: float, high: float) -> None:
-    if isinstance(value, Mapping):
-        for name, number in value.items():
-            _refuse_outside(f"{flag} {name}", number, low, high)
-    elif not (low <= value <= high and math.isfinite(value)):
-        until = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-        raise InputError(f"{flag} {value}: expected a number {until}")
 
 
 def runner_config(options: TrainOptions, network: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """``data stats``: five numbers of each episode, and the episodes that are unlike the others of their task.
 
 They are what users of LeRobot's visualizer look for by eye: length, jerk, stillness, final pose, and how far the robot
-was from what it was told.
+was from its commands.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MAD_SCALE = 1.4826
 LEAST_SPREAD = 0.02
 """Least spread that a score is measured in, as a fraction of the median: equal episodes have no outliers."""
 LEAST_GROUP = 5
-"""Episodes of a task and tracker from which one may be said to be unlike the others."""
+"""Least number of episodes of a task and tracker among which one can be unlike the others."""
 MOST_LINES = 40
 """Episodes in the table that is printed."""
 

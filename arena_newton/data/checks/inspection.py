@@ -62,7 +62,7 @@ class Curve:
 
     name: str
     points: Markup
-    """As `polyline` takes them."""
+    """Points as `polyline` takes them."""
     colour: int
     faint: bool = False
     """True for the measured values, drawn behind the commanded ones."""
@@ -94,7 +94,7 @@ class Shown:
     strip: Markup
     """JPEG as text of base 64; empty without a video."""
     times: tuple[str, ...]
-    """Of the strip's pictures."""
+    """Times of the strip's pictures."""
     bands: tuple[tuple[str, int, float, float], ...]
     """Phases: name, colour, begin and width in units of the panel."""
     panels: tuple[Panel, ...]

@@ -243,7 +243,7 @@ def _check_features(subject: _Subject) -> None:
 
 
 def _check_origin(subject: _Subject) -> None:
-    """The list of episodes in block `arena`, and what is said of all of them together."""
+    """Check the list of episodes in block `arena`, and its lists of what they have in common."""
     assert subject.arena is not None
     episodes = subject.arena.get("episodes")
     number = len(episodes) if isinstance(episodes, list) else 0

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["DATASET_FILE", "Motion", "motions"]
 
 DATASET_FILE = Path("meta") / "info.json"
-"""By which a folder is a dataset; others are of recordings."""
+"""File that makes a folder a dataset; other folders are of recordings."""
 
 
 @dataclass(frozen=True)

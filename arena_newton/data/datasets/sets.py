@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["held_out", "merge", "split"]
 
 DATASET_FILE = Path("meta") / "info.json"
-"""By which a folder is a dataset; others are of recordings."""
+"""File that makes a folder a dataset; other folders are of recordings."""
 
 
 def held_out(seed: int | str, fraction: float, salt: int = 0) -> bool:

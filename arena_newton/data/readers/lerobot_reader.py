@@ -104,7 +104,7 @@ class DatasetActions:
         return named.pop() if len(named) == 1 else None
 
     def seeds(self) -> list[RecordedSeed]:
-        """Of each episode which one of ours it is; empty where the dataset does not say so.
+        """Seeds of the episodes, where they are ours; empty where the dataset does not name them.
 
         Raises:
             InputError: The block is damaged, or has another number of episodes.

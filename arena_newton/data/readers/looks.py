@@ -13,15 +13,15 @@ A dataset has the films in `looks/`, one per episode, and `looks/looks.json`; Le
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.files.stored_json import read_object
+from arena_newton.files.stored_json import Fit, Json, loaded, read_object, shown
 
 __all__ = ["FIRST_SHAPE", "LOOKS_FOLDER", "MOST_LIGHTS", "MOST_SHAPES", "SCHEMA", "DatasetLooks", "Looks"]
 __all__ += ["dataset_looks", "described_looks", "film_path"]
@@ -36,15 +36,23 @@ MOST_LIGHTS = 2
 """Second lights of an episode: a picture has three channels."""
 
 
+def _are_lights(value: Json) -> bool:
+    return 1 <= len(value) <= MOST_LIGHTS and all(len(light) in (1, 4) for light in value)
+
+
+def _are_shapes(value: Json) -> bool:
+    return len(value) <= MOST_SHAPES and all(0.0 <= chance <= 1.0 for _, chance in value)
+
+
 @dataclass(frozen=True)
 class Looks:
     """Meaning of the bytes of a film."""
 
-    stride: int
+    stride: Annotated[int, Fit("1 to 1000", lambda value: 1 <= value <= 1000)]
     """Rows from one frame to the next; the first one is that of row 0."""
-    lights: tuple[tuple[float, ...], ...]
+    lights: Annotated[tuple[tuple[float, ...], ...], Fit("one or two lists, [intensity, direction]", _are_lights)]
     """Second lights: intensity, and of a distant light its direction (unit vector from the light to the scene)."""
-    shapes: tuple[tuple[str, float], ...]
+    shapes: Annotated[tuple[tuple[str, float], ...], Fit(f"at most {MOST_SHAPES} prims and probabilities", _are_shapes)]
     """Prim of each shape, and the probability with which it may get another colour."""
 
     def frames(self, rows: int) -> int:
@@ -80,30 +88,10 @@ class Looks:
         Raises:
             InputError: It is of another version, or damaged; `where` names it.
         """
-        match value:
-            case {"schema": str(schema), **_others} if schema != SCHEMA:
-                raise InputError(f"{where}: schema is {schema[:40]!r}, expected {SCHEMA}")
-            case {"schema": str(), "stride": int(stride), "lights": [*lights], "shapes": [*shapes]}:
-                pass
-            case _:
-                raise InputError(f"{where}: has no schema {SCHEMA} with stride, lights and shapes")
-        if isinstance(stride, bool) or not 1 <= stride <= 1000:
-            raise InputError(f"{where}: stride is {stride}, expected 1 to 1000")
-        fit = all(isinstance(light, list) and len(light) in (1, 4) and all(map(_finite, light)) for light in lights)
-        if not fit or not 1 <= len(lights) <= MOST_LIGHTS:
-            raise InputError(f"{where}: lights are not one or two lists of an intensity and a direction")
-        fit = all(
-            isinstance(shape, list) and len(shape) == 2 and isinstance(shape[0], str) and _finite(shape[1], 1.0)
-            for shape in shapes
-        )
-        if not fit or len(shapes) > MOST_SHAPES:
-            raise InputError(f"{where}: shapes are not at most {MOST_SHAPES} pairs of a prim and a probability")
-        return cls(stride, tuple(map(tuple, lights)), tuple((prim, float(chance)) for prim, chance in shapes))
-
-
-def _finite(value: object, most: float = math.inf) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return number and (most == math.inf or 0.0 <= value <= most)  # type: ignore[operator]  # a number
+        stored = value if isinstance(value, dict) else {}
+        if (schema := stored.get("schema")) != SCHEMA:
+            raise InputError(f"{where}: schema is {shown(schema)}, expected {SCHEMA}")
+        return loaded(where, stored, cls)
 
 
 @dataclass(frozen=True)
@@ -140,7 +128,7 @@ def dataset_looks(root: Path, episodes: int) -> list[DatasetLooks | None]:
     content = read_object(path, 64 << 20)
     listed = content.get("episodes")
     if content.get("schema") != SCHEMA:
-        raise InputError(f"{path}: schema is {str(content.get('schema'))[:40]!r}, expected {SCHEMA}")
+        raise InputError(f"{path}: schema is {shown(content.get('schema'))}, expected {SCHEMA}")
     if not isinstance(listed, list) or len(listed) != episodes:
         raise InputError(f"{path}: episodes is no list of {episodes}, as many as the dataset has")
     found: list[DatasetLooks | None] = []
@@ -150,7 +138,7 @@ def dataset_looks(root: Path, episodes: int) -> list[DatasetLooks | None]:
             continue
         where = f"{path}: episode {number}"
         looks = Looks.read(entry, where)
-        digest = entry.get("sha256") if isinstance(entry, Mapping) else None
+        digest = entry.get("sha256")
         if not isinstance(digest, str):
             raise InputError(f"{where}: sha256 is missing")
         film = film_path(root, number)

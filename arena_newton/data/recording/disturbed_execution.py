@@ -63,7 +63,7 @@ def noise_series(episode_seed: int, ticks: int, levels: NoiseLevels) -> np.ndarr
 
 
 class ActionNoise(Recorder):
-    """A `Disturbance` for `rollout.Rollout`, which is told the beginnings of episodes as one of its recorders."""
+    """A `Disturbance` for `rollout.Rollout`; as one of its recorders it receives the beginnings of episodes."""
 
     def __init__(self, ticks: int, levels: NoiseLevels | None = None):
         """Set up the noise.

@@ -39,7 +39,7 @@ from arena_newton.data.recording.episode_film import FilmFacts
 from arena_newton.errors import ArenaError
 from arena_newton.files.interrupts import Uninterrupted
 from arena_newton.files.own_files import PARTIAL
-from arena_newton.files.own_processes import environment, how_it_ended, start_module
+from arena_newton.files.own_processes import end, environment, how_it_ended, start_module
 from arena_newton.files.pinned_memory import pin, unpin
 
 __all__ = ["EncoderPool"]
@@ -273,17 +273,13 @@ class EncoderPool(VideoEncoder):
                 self._selector.unregister(worker.connection)
             worker.connection.close()
         for worker in self._workers:
-            try:
-                worker.process.wait(STOP_PATIENCE)
-            except subprocess.TimeoutExpired:
-                worker.process.kill()
-                worker.process.wait()
+            end(worker.process, STOP_PATIENCE)
         for slots in self._cameras.values():
             slots.close()
         self._workers, self._cameras, self._open = [], {}, [0] * self._count
 
     def _send(self, worker: _Worker, message: Mapping[str, object]) -> None:
-        """Say something after all that was said before; pictures are told when they are there."""
+        """Send a message after all earlier ones, of which those of pictures wait until the pictures are there."""
         self._unsent.append((None, [(worker, packed(message))]))
         self._flush()
 

@@ -74,9 +74,9 @@ class SlotMemory:
         shape, buffer = (worlds, height, width), self.memory
         firsts = range(0, self.size, stride)
         self.pictures = [np.ndarray((*shape, 3), np.uint8, buffer, first) for first in firsts]
-        """Of each slot, uint8, shape [worlds, H, W, 3]."""
+        """Pictures of each slot, uint8, shape [worlds, H, W, 3]."""
         self.depths = [np.ndarray(shape, np.float16, buffer, first + start) for first in firsts] if depth else None
-        """Of each slot, shape [worlds, H, W]."""
+        """Depth of each slot, shape [worlds, H, W]."""
 
 
 class _Films:
@@ -140,7 +140,7 @@ class _Films:
                 self._answer({"dropped": number})
 
     def _add(self, number: int, picture: np.ndarray, depth: np.ndarray | None) -> None:
-        """Append a picture; a film that cannot be written is told and dropped."""
+        """Append a picture; a film that cannot be written is reported and dropped."""
         if (film := self._films.get(number)) is None:
             return
         try:

@@ -56,7 +56,7 @@ class Field:
 
     name: str
     shape: str
-    """Such as `T, 29`; T is the number of rows; empty: a single value."""
+    """Shape as text, such as `T, 29`; T is the number of rows; empty: a single value."""
     kind: str
     """NumPy type."""
     sentence: str

@@ -72,11 +72,11 @@ class Layout:
 
     name: str
     robot_type: Callable[[str], str]
-    """From the label protocol's name."""
+    """Robot type by the label protocol's name."""
     cameras: Mapping[str, str]
     """Camera as episodes name it → name after `observation.images.`."""
     columns: Callable[[str], tuple[Column, ...]]
-    """From the label protocol's name."""
+    """Columns by the label protocol's name."""
     rows: Callable[[EpisodeFile, str], dict[str, np.ndarray]]
     """Columns of an episode, shape [T, width]."""
     labels: tuple[str, ...] = ("v3.1",)
@@ -231,7 +231,7 @@ LAYOUTS = {
         ),
     )
 }
-"""By the name that `--layout` takes."""
+"""Layouts by the name that `--layout` takes."""
 
 
 def layout(name: str, labels: str) -> Layout:

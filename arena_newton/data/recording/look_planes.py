@@ -17,8 +17,9 @@ import warp as wp
 from arena_newton.data.readers.looks import FIRST_SHAPE, MOST_SHAPES, Looks
 from arena_newton.errors import InputError
 from arena_newton.interfaces import World
-from arena_newton.pictures.camera import DOME_INTENSITY, Camera, WorldLights
+from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.changed_looks import luminance
+from arena_newton.pictures.settings import DOME_INTENSITY
 from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import LightDraw
 
@@ -86,9 +87,7 @@ class LookPlanes:
         labels = {int(shape): model.shape_label[int(shape)] for shape in drawn}
         names = sorted({label for label in labels.values() if not label.startswith(ROBOT)})
         if len(names) > MOST_SHAPES:
-            raise InputError(
-                f"--looks: {env.spec.name} shows {len(names)} shapes, at most {MOST_SHAPES} can be told apart"
-            )
+            raise InputError(f"--looks: {env.spec.name} shows {len(names)} shapes, expected at most {MOST_SHAPES}")
         code = {name: FIRST_SHAPE + number for number, name in enumerate(names)}
         # The first entry is that of a pixel without a shape.
         table = np.zeros(model.shape_count + 1, np.uint8)

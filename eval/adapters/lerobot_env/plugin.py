@@ -16,6 +16,7 @@ from arena_newton.cli.flags import user_path
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds, policy_worlds
 from arena_newton.pictures.settings import CAMERAS, CameraConfig, Fit
+from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ArenaNewtonEnv", "DropRepeated"]
 
-LABELS = ("v3.1", "v4")
-"""Label protocols, `data.readers.label_protocols.LABELS`."""
 FPS = 50
 """Ticks per second."""
 REPEATED = (f"observation.{OBS_STATE}", f"observation.{OBS_ENV_STATE}")
@@ -85,9 +84,9 @@ class ArenaNewtonEnv(EnvConfig):  # type: ignore[misc]  # as above
     labels: str | None = None
     """Protocol of the policy's actions: v3.1, or v4, which is decoded per world; the policy's, or v3.1."""
     realign: float | None = None
-    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick; the policy's."""
+    """Fraction of the gap between commanded and measured heading that v4 closes each tick; the policy's."""
     query_ticks: int | None = None
-    """Of v4: ticks between two queries of the policy, at which `realign` measures the heading: its n_action_steps."""
+    """Ticks between two queries of the policy, at which `realign` of v4 measures the heading: its n_action_steps."""
     task_vector: str | None = None
     """Tasks in the order of the one-hot vector that the policy is given, with commas between; the policy's, or none."""
     tracker_vector: str | None = None

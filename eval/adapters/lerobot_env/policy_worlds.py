@@ -24,9 +24,9 @@ class PolicyWorlds:
     labels: str = "v3.1"
     """Label protocol of its actions, v3.1 or v4."""
     realign: float = 0.0
-    """Of v4: fraction of the gap between commanded and measured heading that is closed each tick."""
+    """Fraction of the gap between commanded and measured heading that v4 closes each tick."""
     query_ticks: int = 20
-    """Of v4: ticks between two queries of the policy, at which the heading is measured."""
+    """Ticks between two queries of the policy, at which v4 measures the heading."""
     task_vector: tuple[str, ...] = ()
     """Tasks in the order of the one-hot vector that the policy is given; none: it is given no such vector."""
     tracker_vector: tuple[str, ...] = ()

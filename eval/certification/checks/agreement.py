@@ -36,7 +36,7 @@ SAME_TICKS = 5
 """Ticks in which both engines must be in the same state: all that is free falls, the drives move every joint, and no
 contact makes more of a last bit."""
 MOVED = 0.05
-"""By so much the drives' targets are away from the joints [rad]."""
+"""Distance of the drives' targets from the joints [rad]."""
 SAME_STATE = 1e-5
 """Largest difference of a position [m, rad] in them; 4e-7 where both step the same model, and 7e-5 at the first tick
 where 3 % of gravity is missing."""

@@ -35,7 +35,7 @@ FILLED = 0.9
 RESET_WORLDS = 4
 """Episodes whose worlds are compared after the reset."""
 SEMANTIC_LOSS = (3, 60)
-"""So many successes of so many episodes may semantic mode cost or give."""
+"""Successes, of so many episodes, by which semantic mode may differ."""
 
 
 def visual(context: Context) -> CheckFinding:

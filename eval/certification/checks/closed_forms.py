@@ -52,7 +52,7 @@ PULL = 1.05
 PUSH = 20.0
 """Force that weighs a link [N]."""
 DRIVE_TOLERANCE = 0.01
-"""Of stiffness and damping of one joint's drive."""
+"""Relative tolerance of stiffness and damping of one joint's drive."""
 BOUNCE = (-0.005, 0.03)
 """Allowed error of a ball's coefficient of restitution: its contact adds up to 0.025 with the depth at which a physics
 step finds it (`ball.BALL_SPRING`)."""
@@ -62,11 +62,11 @@ DIVERGED = 1e300
 """Measurement of a world that diverged."""
 WORLDS = 12
 HIGH = 6.0
-"""At this height [m] nothing touches what falls freely within a second."""
+"""Height from which a body falls freely for a second without a touch [m]."""
 FALL_TICKS = 5
 """Half of the fall's length."""
 DEFLECTION = 0.005
-"""By so much a drive is bent [rad]."""
+"""Angle by which a drive is bent [rad]."""
 HELD_STEPS, REST_STEPS = 200, 4000
 """Physics steps for which it is held, and in which it comes to rest."""
 SETTLING_TICKS, STARTING_TICKS, SLIDING_TICKS = 15, 5, 25
@@ -89,7 +89,7 @@ class Measurement(NamedTuple):
 
     @property
     def deviation(self) -> float:
-        """As a part of what it is to be."""
+        """Difference from the expected value, as a part of it."""
         return self.measured / self.expected - 1.0
 
     def finite(self) -> Measurement:

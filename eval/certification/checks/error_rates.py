@@ -38,15 +38,15 @@ SPREAD = 0.15
 EPISODES = 60
 """Episodes of each task: the protocol's."""
 DIFFERENCES = (0.0, 0.1, 0.2)
-"""By how much the last of the policies is better, in every episode."""
+"""Advantages of the last of the policies, in every episode."""
 SPREADS = (0.0, 0.05, 0.1, 0.2)
 """Standard deviations between trainings of one recipe."""
 TRAININGS = 3
-"""Of a recipe, where they say how much they differ."""
+"""Trainings of a recipe, where they show how much they differ."""
 SLACK = 1e-4
-"""Probability with which a test that keeps its level exactly would be said not to."""
+"""Probability with which a test that keeps its level exactly is found to exceed it."""
 LEAST_COVERAGE = 0.93
-"""Of the intervals of nominally 95 %, which are approximations."""
+"""Least coverage of the intervals of nominally 95 %, which are approximations."""
 SEED = 20260611
 
 
@@ -135,13 +135,14 @@ def _paired(rng: np.random.Generator, comparisons: int, episodes: int, differenc
         equal, _, unequal = result.pairs  # of numbers 0 and 1, 0 and 2, 1 and 2
         case.count("McNemar, one task", kind, unequal.strata[0].p <= LEVEL, expected)
         case.count("Cochran-Mantel-Haenszel, all tasks", kind, unequal.p <= LEVEL)
-        case.count("Holm: the last is told from the second", kind, unequal.p_holm <= LEVEL)
+        case.count("Holm: the last is found to differ from the second", kind, unequal.p_holm <= LEVEL)
         nulls = [equal] if difference else list(result.pairs)
-        case.count("Holm: any two equal ones told apart", "error", any(pair.differs for pair in nulls))
+        case.count("Holm: any two equal ones found to differ", "error", any(pair.differs for pair in nulls))
         shared = all(set(result.overall[p.first].letters) & set(result.overall[p.second].letters) for p in nulls)
         case.count("letters: two equal ones share none", "error", not shared)
         within = [part for pair in nulls for part in pair.strata]
-        case.count("Holm, within tasks: any two equal ones told apart", "error", any(p.p_holm <= LEVEL for p in within))
+        differing = any(part.p_holm <= LEVEL for part in within)
+        case.count("Holm, within tasks: any two equal ones found to differ", "error", differing)
         interval = unequal.difference
         case.count("interval of the mean difference covers", "coverage", interval.low <= -difference <= interval.high)
         interval = unequal.strata[0].difference

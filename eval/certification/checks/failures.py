@@ -25,7 +25,7 @@ LEAST = 0.8
 QUICK_FAILURES = 2
 """Episodes of each kind of failure and tracker under --quick, all in one task."""
 ENOUGH = 20
-"""From so many episodes on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
+"""Episodes from which on a part itself is held to the bar; of fewer, its 95 % interval must reach it."""
 
 
 TUNED: Mapping[str, tuple[int, ...]] = {
@@ -45,7 +45,7 @@ on were seen chooses another."""
 
 @dataclass(frozen=True)
 class Confusion:
-    """Scripted failures by the stage that was scripted and the stage that was said."""
+    """Scripted failures by the stage that was scripted and the stage that was found."""
 
     counts: Mapping[tuple[FailureStage, FailureStage], int]
     """(scripted, found) → episodes."""
@@ -59,7 +59,7 @@ class Confusion:
         return sum(self.counts.get((scripted, stage), 0) for scripted in FailureStage)
 
     def recall(self, stage: FailureStage) -> float | None:
-        """Part of the scripted failures of a stage that are said to be of it; None without any."""
+        """Part of the scripted failures of a stage that are found to be of it; None without any."""
         return self._part(stage, self.scripted(stage))
 
     def precision(self, stage: FailureStage) -> float | None:
@@ -76,7 +76,7 @@ def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Conf
 
 
 def failures(context: Context) -> CheckFinding:
-    """Let saboteurs fail, and compare what was scripted with what is said; count how often rules and readers agree."""
+    """Let saboteurs fail, and compare scripted stages with found ones; count how often rules and readers agree."""
     tasks = [task for task in context.tasks if task in INTERACTIONS]
     if not tasks:
         return skipped(f"no signals are defined for {' '.join(context.tasks)}")
@@ -134,7 +134,7 @@ def _quick_task(name: str) -> str | None:
 def _below(matrix: Confusion) -> list[tuple[str, bool]]:
     """Stages whose precision or recall is below the bar, and whether the episodes are enough to show it.
 
-    One that was not scripted has no bar: what is said to be of it counts against the recall of the others.
+    One that was not scripted has no bar: what is found to be of it counts against the recall of the others.
     """
     found = []
     for stage in FailureStage:
@@ -164,7 +164,7 @@ def _sheet(task: str, matrix: Confusion) -> Table:
         )
         for scripted in FailureStage
     ]
-    head = ("scripted", *(f"said {stage}" for stage in FailureStage), "recall", "precision")
+    head = ("scripted", *(f"found {stage}" for stage in FailureStage), "recall", "precision")
     return Table(head, rows, title=f"{task}: scripted failures (rows) and what the rules say (columns)")
 
 

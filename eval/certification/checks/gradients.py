@@ -40,17 +40,17 @@ KINK = TOLERANCE
 """Largest difference between slopes within the step and the estimate. Beyond it the function has a kink there, or is
 smaller than float32 resolves: there is no one slope to compare with."""
 COMPARABLE = 0.1
-"""Of the slopes at least so many must be comparable. Feet abreast are a kink of VisNavi's margin, for a start."""
+"""Least fraction of the slopes that is comparable. Feet abreast are a kink of VisNavi's margin, for example."""
 MOVED = (0, 1, 2, 3, 4, 5, 6, 7, 8)
 """Numbers of the action to which the conversion is differentiated: planar displacement, height, rotation."""
 TURNED = (0.01, -0.02, -0.01, 0.05, 0.05, -0.04, 0.03, 0.02, 0.06)
-"""By how much they are away from standing: the rotation is none of the axes'."""
+"""Differences from standing; the rotation is about none of the axes."""
 HELD = 4
 """Ticks for which the action is held."""
 ACTION_STEP = 2e-3
 """Step of the differences in the numbers of an action."""
 POSE_STEP = 5e-4
-"""In positions [m], quaternions, angles [rad] and velocities."""
+"""Step in positions [m], quaternions, angles [rad] and velocities."""
 EVERY = 20
 """Ticks between two looks at a margin."""
 TICKS = (300, 1500)

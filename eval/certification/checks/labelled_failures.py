@@ -28,7 +28,7 @@ class LabelledFailure:
     number: int
     """Even: thresholds were set with it; odd: they were not."""
     stages: tuple[FailureStage, ...]
-    """By the rules, then by each reader."""
+    """Stages by the rules, then by each reader."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _judgements(path: Path, record: EpisodeRecord, row: dict[str, str]) -> tuple
 
 
 def agreements(failures: Sequence[LabelledFailure]) -> list[JudgeAgreement]:
-    """Of the rules with each reader and of the readers, for even and odd numbers and for all."""
+    """Agreements of the rules with each reader and of the readers, for even and odd numbers and for all."""
     found = []
     for a, b in itertools.combinations(range(len(failures[0].stages)), 2):
         for part, remainders in PARTS.items():
@@ -99,6 +99,6 @@ def labelled_sheets(failures: Sequence[LabelledFailure]) -> list[Table]:
     for a, b in itertools.combinations(range(len(failures[0].stages)), 2):
         counts = Counter((one.stages[b], one.stages[a]) for one in failures)
         table = tuple((str(row), *(str(counts[row, text]) for text in FailureStage)) for row in FailureStage)
-        head = (JUDGES[b], *(f"said {stage}" for stage in FailureStage))
+        head = (JUDGES[b], *(f"found {stage}" for stage in FailureStage))
         sheets.append(Table(head, table, title=f"real failures: {JUDGES[b]} (rows) and what {SAYS[a]} (columns)"))
     return sheets

@@ -68,7 +68,7 @@ def _without_legs(context: Context, body: str) -> tuple[dict[str, int], Table, t
 
 
 def _broken(context: Context, body: str) -> tuple[str, ...]:
-    """Why zero successes would say nothing: episodes ended as errors, or nobody solves the task with legs either."""
+    """Reasons for which zero successes show nothing: errors, or nobody solves the task with legs either."""
     lines = []
     for tracker, task in itertools.product(context.sample, context.tasks):
         records = context.evaluate(_cell(context, task, tracker, body))

@@ -27,7 +27,7 @@ ASPECT = 4.0 / 3.0
 TOLERANCE = 0.005
 """Largest deviation of the picture's half width and half height at unit distance."""
 LEAST = 500
-"""So many pixels must show the floor."""
+"""Least number of pixels that show the floor."""
 TASKS = 2
 """Tasks whose pictures are measured under --quick."""
 

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
 from arena_newton.eval.reports import report
 from arena_newton.eval.workers import shard_merge
-from arena_newton.files.own_processes import environment
+from arena_newton.files.own_processes import end, environment, start_module
 from arena_newton.files.stored_json import Json, JsonObject
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
@@ -47,9 +46,9 @@ RAY_MINUTES = 60.0
 POLL = 0.2
 """The journal is looked at so often [s]."""
 ENDING = 60.0
-"""Time for the cluster to end when it is told to [s]."""
-COMMAND = (sys.executable, "-P", "-m", "arena_newton.eval")
-"""Command that plays on a cluster."""
+"""Time for the cluster to end after its stop is requested [s]."""
+PROGRAM = "arena_newton.eval"
+"""Module that plays on a cluster."""
 ACTOR = b"ray::RayActor.play"
 """Title prefix of a process while it plays for a cluster."""
 REPLACED = "left: a process"
@@ -216,15 +215,14 @@ def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:
     folder.parent.mkdir(parents=True, exist_ok=True)
     log, code = folder.with_suffix(".log"), None
     with open(log, "wb") as output:
-        process = subprocess.Popen(
-            [*COMMAND, "run", *words(cluster)], env=environment(), stdout=output, stderr=output, start_new_session=True
-        )
+        to = output.fileno()
+        process = start_module(PROGRAM, "run", *words(cluster), variables=environment(), output=to, errors=to)
         try:
             killed_after = _kill_one(process, folder)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 code = process.wait(60.0 * RAY_MINUTES)
         finally:
-            _end(process)
+            end(process, ENDING, signal.SIGTERM)  # it then ends its cluster
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     last = next((line for line in reversed(lines) if line.strip()), "")
     return RayRun(code, killed_after, sum(REPLACED in line for line in lines), plain_text(last, 300))
@@ -242,18 +240,6 @@ def _kill_one(process: subprocess.Popen[bytes], folder: Path) -> int | None:
                 return ended
         time.sleep(POLL)
     return None
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a run that has not ended, first by asking: it then ends its cluster."""
-    if process.poll() is not None:
-        return
-    process.terminate()
-    try:
-        process.wait(ENDING)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _actors(pid: int) -> list[int]:

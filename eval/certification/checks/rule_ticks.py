@@ -144,7 +144,7 @@ class FirstTicks(Recorder):
     def __init__(self) -> None:
         """Know no episode yet."""
         self.found: list[tuple[int | None, int | None]] = []
-        """For each episode that ended: the tick from its states and the one of its verdict; None: no success."""
+        """Ticks of each episode that ended: by its states and by its verdict; None: no success."""
         self._count: dict[int, int] = {}
         self._first: dict[int, int | None] = {}
 

@@ -22,7 +22,7 @@ from arena_newton.pages.tables import Table, percent
 __all__ = ["CHECKS", "retention"]
 
 ENOUGH = 60
-"""With fewer episodes of all tasks together a loss that is not shown says nothing."""
+"""Episodes of all tasks together below which a loss that is not shown proves nothing."""
 SHOWN_BY = 0.05
 """Largest p-value of McNemar's exact test, all tasks together, at which the loss counts as shown."""
 

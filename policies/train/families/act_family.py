@@ -53,7 +53,7 @@ class ActModel(TrainableModel):
         return parameter.startswith("model.backbone")
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Without what a stock ACT, whose encoder is frozen, has no name for."""
+        """State without what a stock ACT, whose encoder is frozen, has no name for."""
         return {name: value for name, value in super().state_dict().items() if not name.endswith(_COUNTER)}
 
 
@@ -69,7 +69,7 @@ def with_batch_norm(network: nn.Module) -> None:
 
 
 def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
-    """As of `families.check_weights`."""
+    """Check weights as `families.check_weights` does."""
     check_resnet(recipe, weights)
 
 

@@ -28,7 +28,7 @@ class DiffusionModel(TrainableModel):
     """Diffusion Policy and its loss."""
 
     def __init__(self, recipe: TrainingRecipe, stats: Stats, device: torch.device, policy: PreTrainedPolicy):
-        """With the noise schedule on the device: LeRobot's copies it there in every step."""
+        """Make one with the noise schedule on the device: LeRobot's copies it there in every step."""
         super().__init__(recipe, stats, device, policy)
         kept = policy.diffusion.noise_scheduler.alphas_cumprod.to(device)
         self._signal, self._noise = kept**0.5, (1.0 - kept) ** 0.5
@@ -65,7 +65,7 @@ class DiffusionModel(TrainableModel):
 
 
 def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
-    """As of `families.check_weights`."""
+    """Check weights as `families.check_weights` does."""
     check_resnet(recipe, weights)
 
 

@@ -64,7 +64,7 @@ class FlowModel(TrainableModel):
         tokenizer: PreTrainedTokenizerBase,
         own: bool,
     ):
-        """With its encoders.
+        """Make one with its encoders.
 
         Args:
             recipe: Of the training.
@@ -118,7 +118,7 @@ class FlowModel(TrainableModel):
         return parameter.startswith("observation_encoder.vision_encoder")
 
     def save(self, folder: Path, facts: CheckpointFacts, precision: str = "float32") -> None:
-        """As of every family, with the architecture of CLIP and the tokenizer."""
+        """Save as every family does, with the architecture of CLIP and the tokenizer."""
         encoder = self.policy.observation_encoder
         if self.own:
             name = str(finished(folder) / CLIP_FOLDER)
@@ -141,7 +141,7 @@ def _strings(task: object, rows: int) -> list[str]:
 
 
 def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
-    """As of `families.check_weights`."""
+    """Check weights as `families.check_weights` does."""
     if weights is not None or not isinstance(recipe.network.get("clip"), Mapping):
         _clip_folder(recipe, weights)
 

@@ -92,7 +92,7 @@ class Pi05Model(TrainableModel):
         tokenizer: PreTrainedTokenizerBase,
         name: str,
     ):
-        """With its tokenizer.
+        """Make one with its tokenizer.
 
         Args:
             recipe: Of the training.
@@ -104,7 +104,7 @@ class Pi05Model(TrainableModel):
         """
         self.tokenizer, self.tokenizer_name = tokenizer, name
         self.weights_checksum = ""
-        """Of the base's tensors without `PADDED`; empty with new weights."""
+        """Checksum of the base's tensors without `PADDED`; empty with new weights."""
         super().__init__(recipe, stats, device, policy)
         set_tokenizer_name(self.preprocess, name)
 
@@ -156,7 +156,7 @@ class Pi05Model(TrainableModel):
         return ".vision_tower." in parameter
 
     def save(self, folder: Path, facts: CheckpointFacts, precision: str = "float32") -> None:
-        """As of every family, with the tokenizer. A policy in bfloat16 is written as it is."""
+        """Save as every family does, with the tokenizer. A policy in bfloat16 is written as it is."""
         if not self.tokenizer_name:
             set_tokenizer_name(self.preprocess, str(finished(folder) / TOKENIZER_FOLDER))
         super().save(folder, facts, precision)
@@ -232,7 +232,7 @@ def load_base(policy: PreTrainedPolicy, path: Path) -> str:
 
 
 def check_weights(recipe: TrainingRecipe, weights: str | Path | None) -> None:
-    """As of `families.check_weights`."""
+    """Check weights as `families.check_weights` does."""
     folder = _base(recipe, weights)
     if folder is not None and not _holds_tokenizer(folder) and not isinstance(recipe.network.get("gemma"), Mapping):
         weights_folder(TOKENIZER, "tokenizer of PaliGemma", TOKENIZER_FILES)

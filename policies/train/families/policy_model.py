@@ -111,7 +111,7 @@ class TrainableModel(abc.ABC):
     """True if the policy reads the task's instruction."""
 
     def __init__(self, recipe: TrainingRecipe, stats: Stats, device: torch.device, policy: PreTrainedPolicy):
-        """With processors that are made from the statistics.
+        """Make one with processors of the statistics.
 
         Args:
             recipe: Of the training.

@@ -20,8 +20,8 @@ MIX = 0x9E3779B97F4A7C15
 BLOCK_STEPS = 256
 """Steps whose balanced rows are drawn at once."""
 UNKNOWN_FRACTION = 0.05
-"""Fraction of the training samples whose tracker is said to be another than those of the vector: for play through one
-of which there are no demonstrations."""
+"""Fraction of the training samples whose tracker input is the entry for trackers that the vector lacks: for play
+through one of which there are no demonstrations."""
 
 
 def step_seed(seed: int, step: int, rank: int = 0) -> int:
@@ -122,7 +122,7 @@ class BatchMaker:
     tracker_vector: Sequence[str] = ()
     """Trackers in the order of the numbers that follow in it, as of `CheckpointFacts`; none: it has no such numbers."""
     tall: int = 0
-    """As of `gathered_pictures`."""
+    """Height as in `gathered_pictures`."""
     tokens: Mapping[str, torch.Tensor] | None = None
     """Tokens of language of every instruction, or of every row: key → shape [instructions or rows, L]."""
     tokens_per_row: bool = False

@@ -158,7 +158,9 @@ class DecoderPool:
             with self._whole:
                 try:
                     slots = mapped(self._fd, number, self._slot)
-                    process = start_module(PROGRAM, *facts, files=[self._fd], variables=variables, pipes=True)
+                    process = start_module(
+                        PROGRAM, *facts, files=[self._fd], variables=variables, output=subprocess.PIPE
+                    )
                 except OSError:  # the user's limit of processes, or of memory: those that there are decode
                     break
                 self._workers.append(_Worker(process, slots))

@@ -51,7 +51,7 @@ class EpisodeRows:
     states: np.ndarray
     """float32, shape [T, 64]."""
     actions: np.ndarray
-    """In the protocol of the training, float32, shape [T, 40]."""
+    """Actions in the label protocol of the training, float32, shape [T, 40]."""
     instruction: str
     task: str
     """Name of our task; empty where the dataset does not tell."""
@@ -78,7 +78,7 @@ class DatasetRows:
     width: int
     """Width of a picture [px]."""
     picture_statistics: Mapping[str, Mapping[str, np.ndarray]]
-    """Of each camera per channel on the scale 0 to 1, shape [3, 1, 1], and `count`."""
+    """Statistics of each camera per channel on the scale 0 to 1, shape [3, 1, 1], and `count`."""
     hash: str
     """`content_hash`."""
 

@@ -246,7 +246,7 @@ def load_frames(
             # Some picture is not black where the first ones of all episodes are: only what is black in all is cut off.
             del pictures
             if device.type == "cuda":
-                torch.cuda.empty_cache()  # whoever asks what is free is not told of what torch keeps
+                torch.cuda.empty_cache()  # memory that torch keeps does not count as free
             (top, bottom), on_frames = black, lambda count: None
     episodes = [episode for dataset in datasets for episode in dataset.episodes]
     held = [number >= len(d.episodes) - hold_out for d in datasets for number in range(len(d.episodes))]

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 import torch
 
+from arena_newton.pictures.changed_looks import hue_lacks
+
 __all__ = ["CHOSEN", "RANGES", "TRANSLATION", "TransformDraw", "drawn_transforms", "transformed"]
 
 CHOSEN = 3
@@ -94,7 +96,7 @@ def _saturation(pictures: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 
 
 def _hue(pictures: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """To hue, saturation and value, and back with another hue."""
+    """Convert to hue, saturation and value, and back with another hue."""
     low, high = pictures.aminmax(dim=1, keepdim=True)
     span = torch.where(high == low, 1.0, high - low)
     to_red, to_green, to_blue = ((high - pictures) / span).split(1, dim=1)
@@ -103,9 +105,7 @@ def _hue(pictures: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
         high == red, to_blue - to_green, torch.where(high == green, 2.0 + to_red - to_blue, 4.0 + to_green - to_red)
     )
     sixths = 6.0 * torch.remainder(torch.remainder(sixths / 6.0, 1.0) + turns, 1.0)
-    # A colour is full within a sixth of the circle to both sides of its own, and zero beyond two.
-    offsets = torch.stack([torch.remainder(sixths + n, 6.0) for n in (5.0, 3.0, 1.0)], dim=1).squeeze(2)
-    return high - (high - low) * torch.minimum(offsets, 4.0 - offsets).clamp_(0.0, 1.0)
+    return high - (high - low) * hue_lacks(sixths.squeeze(1), 1)
 
 
 def _sharpness(pictures: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:

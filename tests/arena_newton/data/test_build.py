@@ -272,7 +272,7 @@ def test_a_killed_build_leaves_nothing_or_everything(recordings, dataset, tmp_pa
 
 
 def test_a_package_that_is_not_installed_has_no_version(recordings, tmp_path, monkeypatch):
-    """From PYTHONPATH alone this package builds too and tells its own version; versions that nobody tells are null."""
+    """This package builds from PYTHONPATH alone too and tells its own version; versions that nobody tells are null."""
     version = importlib.metadata.version
 
     def told(absent):

@@ -52,7 +52,7 @@ def film(encoder, folder):
 
 
 def dropped(encoder, streams):
-    """Drop films; whether that was said of each."""
+    """Drop films; True for each that was reported."""
     said = []
     for stream in streams:
         encoder.discard(stream.worker, {"front": stream}, lambda: said.append(1))
@@ -128,7 +128,7 @@ def children(parent, wanted):
 
 
 def test_a_killed_process_is_one_clear_error(tmp_path):
-    """The films of a killed process are lost and said to be, those of the others are whole; nothing waits for ever."""
+    """The films of a killed process are lost and reported, those of the others are whole; nothing waits for ever."""
     pool = EncoderPool(2, 1)
     streams = begin(pool, tmp_path, worlds=2)
     pool.add("front", streams, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half())

@@ -147,7 +147,7 @@ def test_looks_are_of_the_pictures(folder):
 
 
 def test_an_episode_without_a_success_can_be_left_out(env, tmp_path):
-    """With only_success a timeout leaves no file, and is told without files."""
+    """With only_success a timeout leaves no file, and is reported without files."""
     camera = {"front": CameraConfig(32, 32)}
     with DemonstrationRecorder(tmp_path, cameras=camera, only_success=True, threads=1) as recorder:
         Rollout(env, policies.get("stand"), [planned(0)], recorder=recorder, max_steps=5).run()

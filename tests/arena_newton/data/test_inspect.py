@@ -49,7 +49,7 @@ def test_figures_are_what_they_say():
 
 
 def test_the_odd_one_is_found():
-    """Of eight alike episodes and one that differs in one figure, that one ranks first, for that figure alone."""
+    """One episode that differs from eight alike ones in one figure ranks first, for that figure alone."""
     rng = np.random.default_rng(0)
     time = 0.02 * np.arange(200)
     usual = [motion(0.5 * time + rng.normal(0, 1e-3), name=f"{n}") for n in range(8)]

@@ -46,13 +46,13 @@ def beginning_still(actions: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("rows", [1, 2, 700, 10_000])
 def test_an_episode_comes_back_exactly(rows):
-    """To v4 and back changes no number of a row but the first by more than 1e-6, however long and often turned."""
+    """Conversion to v4 and back changes no number of rows after the first by more than 1e-6, however many turns."""
     actions = wandering(rows, rows)
     assert np.abs(decode_v4(encode_v4(actions)) - beginning_still(actions)).max() < 1e-6
 
 
 def test_the_first_row_commands_no_motion():
-    """As the authors' draft demands (§6.3); the second row takes the heading from the episode's start."""
+    """Rows follow the authors' draft (§6.3); the second row takes the heading from the episode's start."""
     actions = actions_of(np.array([0.02, 0.03, 0.03]), np.full(3, 0.1), np.full(3, 0.2))
     labels = encode_v4(actions)
     assert not labels[0, V4["velocity_xy"]].any() and not labels[0, V4["yaw_rate"]].any()

@@ -58,7 +58,7 @@ def test_bytes_name_shapes_and_their_objects():
 
 
 def test_second_lights_are_never_those_of_visual_mode():
-    """Of 4,000 lights none comes from within 5° of any direction of visual mode, and domes are none of its lights."""
+    """None of 4,000 lights comes from within 5° of any direction of visual mode, and domes are none of its lights."""
     steep = [draw_light(seed, LightRange()) for seed in range(4000)]
     widest = max(np.degrees(np.arccos(-light.direction[2])) for light in steep)
     assert visual_angle() - 2.0 < widest <= visual_angle()
@@ -118,11 +118,11 @@ FAULTS = {
     "exchanged": (exchanged, "episode_000001.mp4, episode 1: is not the film of looks.json"),
     "cut": (cut, "episode_000000.mp4, episode 0: is not the film of looks.json"),
     "missing": (lambda dataset: (dataset / "looks" / "episode_000001.mp4").unlink(), "episode_000001.mp4: is missing"),
-    "another version": (edited("schema", "arena_looks_v9"), "schema is 'arena_looks_v9', expected arena_looks_v1"),
+    "another version": (edited("schema", "arena_looks_v9"), 'schema is "arena_looks_v9", expected arena_looks_v1'),
     "too few": (edited("episodes", []), "is no list of 3"),
     "no stride": (edited("episodes", 0, "stride", 0), "looks.json: episode 0: stride is 0"),
-    "a light that is none": (edited("episodes", 0, "lights", [["bright"]]), "episode 0: lights are not"),
-    "a shape that is none": (edited("episodes", 1, "shapes", [["/World/Floor", 2.0]]), "episode 1: shapes are not"),
+    "a light that is none": (edited("episodes", 0, "lights", [["bright"]]), "episode 0: lights is [["),
+    "a shape that is none": (edited("episodes", 1, "shapes", [["/World/Floor", 2.0]]), "episode 1: shapes is [["),
     "another stride": (edited("episodes", 0, "stride", 4), "looks, episode 0: are not the looks of"),
 }
 

@@ -210,7 +210,7 @@ def test_sets_of_two_kinds_are_refused(built, tmp_path, capsys):
 
 
 def test_damaged_sets(built, tmp_path, capsys, mutants):
-    """Of many damaged sets each is merged, or refused in one line that names it; nothing half is left."""
+    """Each of many damaged sets is merged, or refused in one line that names it; nothing half is left."""
     rng, other = random.Random(5), changed(built / "b", tmp_path / "b")
     sound = {path: path.read_bytes() for path in sorted(other.rglob("*")) if path.is_file()}
     counts = {0: 0, 2: 0}

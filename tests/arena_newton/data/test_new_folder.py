@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.files.new_folder import LOCK, held_folder, link, new_folder, scratch_folder
+from arena_newton.files.new_folder import LOCK, held, held_folder, link, new_folder, scratch_folder
 from arena_newton.files.own_files import PARTIAL
 
 SLOW = """
@@ -41,6 +42,20 @@ def test_a_held_folder_is_one_process_s(tmp_path):
                 pass
     with held_folder(tmp_path / "out", "trains in it"):
         pass
+
+
+def test_a_held_file_is_shared_or_waited_for(tmp_path):
+    """Those that share a file hold it together; one that wants it alone is refused, or waits until it is free."""
+    path, taken = tmp_path / "lock", "is taken"
+    with held(path, taken, shared=True), held(path, taken, shared=True):
+        with pytest.raises(InputError, match=taken), held(path, taken):
+            pass
+    with ThreadPoolExecutor() as pool:
+        with held(path):
+            waiting = pool.submit(lambda: held(path, wait=True).__enter__())
+            with pytest.raises(TimeoutError):
+                waiting.result(0.2)
+        assert waiting.result(20.0) >= 0
 
 
 def test_an_error_leaves_nothing(tmp_path):

@@ -323,7 +323,7 @@ def many_files(tmp_path_factory):
 
 
 def test_the_first_mismatch_is_that_of_any_number_of_threads(many_files, tmp_path):
-    """Of a late fault in an early file and early ones in later files the former is named, however many threads work."""
+    """A late fault in an early file is named, not early ones in later files, however many threads work."""
     sound, recordings = many_files
     videos = [f"videos/observation.images.front/chunk-000/file-{number:03d}.mp4" for number in range(4)]
     assert all((sound / video).is_file() for video in videos)

@@ -305,7 +305,7 @@ def test_statistics_of_a_feature_that_never_changes_are_refused(folder, mode, fe
 
 
 def test_statistics_that_nothing_uses_may_be_anything(folder):
-    """Of a feature that goes in as it is, and the actions' for an input, which only a training normalises."""
+    """Features that go in as they are, and the actions' for an input, which only a training normalises."""
     modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD", "ENV": "MEAN_STD"}
     edit(folder / "config.json", normalization_mapping=modes)
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
@@ -317,7 +317,7 @@ def test_statistics_that_nothing_uses_may_be_anything(folder):
 
 
 def test_transforms_at_random_are_refused(tmp_path):
-    """As the original's server refuses them; a size or a colour that cannot be is named."""
+    """Pictures are refused as by the original's server; a size or a colour that cannot be is named."""
     for changes, message in (
         ({"random_order": True}, "random_order false"),
         ({"max_num_transforms": 1}, "max_num_transforms of at least"),
@@ -392,7 +392,7 @@ def test_a_picture_of_another_size_is_refused(checkpoints):
 
 
 def test_it_works_without_a_reset_or_an_environment(checkpoints):
-    """As a policy server's first request: memory is made for the worlds that are shown."""
+    """A first request like a policy server's: memory is made for the worlds that are shown."""
     policy = LeRobotPolicy(checkpoints["act"])
     assert policy.act(seen([1, 2, 3], [0, 0, 0])).actions.shape == (3, policy.chunk_size, 40)
     assert set(follow(policy, [1, 2], 1)) == {1, 2}

@@ -114,7 +114,7 @@ def asking(url, **options):
 
 
 class Recorder:
-    """Memory of a server, and the faults that it is told to have."""
+    """Memory of a server, and the faults that it is given."""
 
     def __init__(self):
         OPENED.append(self)

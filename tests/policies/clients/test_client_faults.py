@@ -132,7 +132,7 @@ def test_failed_reset_ends_its_world(running):
 @pytest.mark.parametrize("protocol", [*SOCKETS, "gr00t"])
 @pytest.mark.parametrize("how", ["in a batch", "between two"])
 def test_killed_server_stops_the_run(protocol, how):
-    """When the server dies no world is called an error: the run stops, and its episodes stay unplayed."""
+    """A server's death is no world's error: the run stops, and its episodes stay unplayed."""
     server = started(protocol)
     policy = client(server, timeout=5.0, retries=1)
     assert policy.act(observation(3)).errors == {}

@@ -1,4 +1,4 @@
-"""Declarations of servers are compared before the first episode; absent ones are tried, assumed and said."""
+"""Declarations of servers are compared before the first episode; absent ones are tried, assumed and reported."""
 
 import copy
 import http.client

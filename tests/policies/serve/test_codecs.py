@@ -104,6 +104,11 @@ def test_golden_roboarena():
     metadata = unpack(openpi_codec.pack_metadata(expected_facts(), roboarena=True), OPENPI_KEYS, "x")
     fields = "image_resolution needs_wrist_camera n_external_cameras needs_stereo_camera needs_session_id action_space"
     assert list(metadata) == fields.split()
+    picture = ServedPicture(64, 64)
+    for names, counts in (((), (False, 0)), (("front",), (False, 1)), (("left_wrist",), (True, 0))):
+        facts = ServedFacts(needs_picture=bool(names), cameras=dict.fromkeys(names, picture) or None)
+        metadata = unpack(openpi_codec.pack_metadata(facts, roboarena=True), OPENPI_KEYS, "x")
+        assert (metadata["needs_wrist_camera"], metadata["n_external_cameras"]) == counts, names
 
 
 def test_golden_vla_eval():

@@ -176,7 +176,7 @@ def asked_with(**images):
 
 
 def test_pictures_stay_packed():
-    """Of the pictures of a message only those of our cameras are ever unpacked, and none before its turn."""
+    """Pictures of our cameras alone are ever unpacked from a message, and none before its turn."""
     frame = asked_with(wrist=picture(*LARGEST), front=picture(32, 24))
     seen = vla_eval_codec.unpack_request(vla_eval_codec.unpack_message(frame))
     assert [*seen.images] == ["front"] and seen.image.unpacked().shape == (24, 32, 3)
@@ -185,7 +185,7 @@ def test_pictures_stay_packed():
 
 
 def test_large_messages_are_read_one_by_one(monkeypatch):
-    """Of thirty large messages one is read at a time, and the others go past those that wait."""
+    """One of thirty large messages is read at a time, and the others go past those that wait."""
     monkeypatch.setattr(message_readers, "LONGEST_PAUSE", 0.0)
     readers, begun, go_on = message_readers.MessageReaders(), threading.Event(), threading.Event()
     large, usual = message_readers.LARGE + 1, 10**6

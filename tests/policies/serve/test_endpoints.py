@@ -323,7 +323,7 @@ def test_routes(served, protocol):
 
 @pytest.mark.parametrize("protocol", ["openpi", "arena"])
 def test_token(served, protocol):
-    """With a token only who sends it is let in; whether the server is there is told to everybody."""
+    """With a token only who sends it is let in; everybody learns whether the server is there."""
     one = served(Remembers(), protocol, token="s3cret")
     right, wrong = {"Authorization": "Bearer s3cret"}, {"Authorization": "Bearer s3cre"}
     assert one.http("GET", "/healthz")[0] == 200
@@ -370,7 +370,7 @@ def test_one_connection_too_many(served):
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval", "arena"])
 def test_errors_are_one_line(served, protocol):
-    """A failing policy, an unfit action and an unfit message are told in one line without paths; the server goes on."""
+    """A failing policy, an unfit action or message is reported in one line without paths; the server goes on."""
     one = served(Fails(), protocol)
 
     def told(kind, **more):
@@ -398,7 +398,7 @@ def test_errors_are_one_line(served, protocol):
 
 
 def test_a_session_that_closes_frees_its_row(served):
-    """As many robots as wanted may come one after the other, also those whose connection is cut off."""
+    """Any number of robots may come one after the other, also those whose connection is cut off."""
     one = served(Remembers(), max_sessions=2, connections=8)
     for number in range(6):
         client = one.socket()
@@ -523,7 +523,7 @@ def test_closing_ends_the_connections(served):
 
 
 def test_a_text_frame_and_a_wrong_type(served):
-    """A text frame is told apart in openpi and vla-eval; a message of the server's own types is refused."""
+    """A text frame is recognised in openpi and vla-eval; a message of the server's own types is refused."""
     one = served(Remembers())
     with one.socket() as client:
         client.recv(timeout=10)

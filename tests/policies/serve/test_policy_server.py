@@ -135,7 +135,7 @@ def test_an_episode_that_is_not_known_is_refused(made):
 
 
 def test_an_episode_of_another_client_is_not_continued(made):
-    """Two clients that take each other's session are told, whichever of them began last, and neither goes on."""
+    """Two clients that take each other's session get an error, whichever of them began last, and neither goes on."""
     server = made(Remembers())
     for seed_of in ("first", "second"):
         server.begin("a", Begin("", 5, "boxing"))
@@ -189,7 +189,7 @@ def test_rows_are_freed(made):
 
 
 def test_tasks_are_asked_one_by_one(made):
-    """A policy is told one task and instruction at a time; name and Gym id mean the same."""
+    """A policy gets one task and instruction at a time; name and Gym id mean the same."""
     server = made(Remembers(), max_wait=0.5)
     asks = [("boxing", "Box."), ("Isaac-Move-Boxing-Bag-G129-Dex3-Wholebody", "Box."), ("football", ""), ("", "Hop.")]
     for n in range(4):
@@ -298,7 +298,7 @@ def test_a_camera_that_no_robot_sends_is_refused(name, camera, said):
 
 
 def test_a_closed_server_refuses(made):
-    """A session that waits when the server closes, and one that comes later, is told so."""
+    """A session that waits when the server closes, and one that comes later, gets an error."""
     server = made(Remembers(pause=0.2))
     waiting = together(lambda: server.query("a", query(seed=1, step=0)), lambda: (time.sleep(0.05), server.close())[0])
     with pytest.raises(Refused, match="closing"):

@@ -110,7 +110,7 @@ def test_what_is_held_arrives_and_grows_old(server):
 
 
 def test_the_newest_page_drives(server):
-    """A second page takes over; the first one is told and moves nothing any more."""
+    """A second page takes over; the first one is notified and moves nothing any more."""
     with page_socket(server) as first:
         first.recv(timeout=READY)
         with page_socket(server) as second:
@@ -319,7 +319,7 @@ class Session:
         return wait_for(look, "address in the log")
 
     def end(self) -> str:
-        """Ctrl-C; what it said."""
+        """Ctrl-C; its messages."""
         self.process.send_signal(signal.SIGINT)
         return "".join(self.process.communicate(READY))
 

@@ -211,7 +211,7 @@ def test_a_sender_drives_as_in_the_original(server, client, tracker, hands):
 
 
 def test_the_handshake_is_the_originals(server, client):
-    """Each episode begins with a new epoch and without anything old; a reset is said to be complete."""
+    """Each episode begins with a new epoch and without anything old; a reset is reported as complete."""
     client.set(keys.ACTION_BODY, "[1]")
     client.set(keys.RESET_TRIGGER, "{}")
     source, _, _ = source_of(server)
@@ -273,7 +273,7 @@ BAD = {
 
 
 def test_unfit_input_is_refused_once_and_the_robot_stands(server, client):
-    """Each kind is told in one line, is never an action, and the next fit frame counts again."""
+    """Each kind is reported in one line, is never an action, and the next fit frame counts again."""
     source, clock, said = source_of(server)
     sender = Sender(client)
     for name, value in BAD.items():

@@ -170,7 +170,7 @@ def drive(driver: Driver, held: Held | None, ticks: int) -> np.ndarray:
 
 
 def test_nobody_there_means_stand():
-    """When messages stop, the walk ends in three seconds without a jump; height and hands stay as they were."""
+    """The walk ends in three seconds when messages stop, without a jump; height and hands stay as they were."""
     driver = Driver()
     driver.begin(standing_view())
     held = Held(forward=1.0, turn=0.5, height=0.7, reach_right=True, close_left=True)
@@ -242,7 +242,7 @@ class Script:
 
 
 def session(env, source, folder, seed=3, **options):
-    """A session that takes no real time; what it said is in `said`."""
+    """A session that takes no real time; its messages are in `said`."""
     said = []
     made = TeleopSession(env, source, folder=folder, seed=seed, pace=timeless(), say=said.append, **options)
     made.said = said
@@ -324,7 +324,7 @@ def test_a_seed_is_not_recorded_twice(saved, env):
 
 
 def test_a_silent_source_stands_and_the_session_goes_on(env, tmp_path):
-    """Silence and actions that are no numbers make the robot stand, are told once, and later actions count again."""
+    """Silence and actions that are no numbers make the robot stand, warn once, and later actions count again."""
     source = Script(silent=lambda n: 60 <= n < 180, spoiled=lambda n: 180 <= n < 240, quit_at=300)
     one = session(env, source, tmp_path)
     one.run()

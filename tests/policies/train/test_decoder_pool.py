@@ -71,7 +71,7 @@ def shared_files():
 
 
 def test_processes_give_what_threads_give(rows, tmp_path):
-    """Pictures, their order, black rows and the number of pictures told are the same."""
+    """Pictures, their order, black rows and the reported number of pictures are the same."""
     both = [rows, read_rows(make_dataset(tmp_path, lengths=(22,), task="football"), "v3.1")]
     told = []
     by_threads = load_frames(both, CPU, jobs=2, processes=0)

@@ -85,7 +85,7 @@ def test_prompts_are_lerobots(model):
 
 
 def test_a_prompt_that_would_be_cut_is_refused():
-    """LeRobot's 200 tokens would lose the end of the state; that is said, with the numbers."""
+    """LeRobot's 200 tokens would lose the end of the state; that is reported, with the numbers."""
     model = families.build(recipe("pi05", "small", network={"tokenizer_max_length": 200}), made_stats(), "cpu")
     with pytest.raises(InputError, match=r"has 2\d\d tokens, the policy reads 200 \(tokenizer_max_length\)"):
         made_batch(model)
@@ -140,7 +140,7 @@ def test_base_weights_that_do_not_fit_are_refused(base):
 
 
 def test_damaged_base_weights_are_one_clear_error(base, model, mutants):
-    """Of mutated files each is loaded completely or refused with one error that names the file."""
+    """Each of the mutated files is loaded completely or refused with one error that names the file."""
     path = base / "model.safetensors"
     refused = 0
     whole, rng = path.read_bytes(), random.Random(1)

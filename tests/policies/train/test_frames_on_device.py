@@ -144,7 +144,7 @@ def test_actions_are_of_the_wanted_protocol(dataset, rows, tmp_path):
 
 
 def test_statistics_are_the_datasets(dataset):
-    """Of all episodes together they are those of the dataset's own `stats.json`; a floor holds constant numbers up."""
+    """Statistics of all episodes are those of the dataset's own `stats.json`; a floor holds constant numbers up."""
     whole = read_rows(dataset, "v3.1")
     found = statistics([whole], whole.episodes, "v3.1")
     stats = LeRobotDatasetMetadata("local/x", root=dataset).stats

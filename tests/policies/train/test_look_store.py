@@ -50,7 +50,7 @@ def test_frames_are_the_films(sets, every, step):
 
 
 def test_the_wanted_fraction_changes(store):
-    """Of one task's samples the wanted fraction changes, of another with a fraction of its own as many as that says."""
+    """The wanted fraction of one task's samples changes, and of another task's its own fraction."""
     torch.manual_seed(0)
     rows = torch.randint(0, store.rows, (8000,))
     taken, changed = store.looks.chosen(rows)

@@ -1,5 +1,6 @@
 """Trainings of a narrow ACT on the CPU: result, resume, signals, several processes, errors."""
 
+import contextlib
 import csv
 import dataclasses
 import itertools
@@ -27,6 +28,7 @@ from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, chec
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import (
+    policy_trainer,
     training,
     training_log,
     training_loop,
@@ -256,7 +258,7 @@ def test_a_killed_training_goes_on(dataset, tmp_path):
 
 @pytest.mark.release
 def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: both processes hold the same weights at each checkpoint, which the first writes."""
+    """Both processes of a torchrun on the CPU hold the same weights at each checkpoint, which the first writes."""
     out, agreed = tmp_path / "run", []
     check = PolicyTrainer.check_agreement
     monkeypatch.setattr(PolicyTrainer, "check_agreement", lambda self: (check(self), agreed.append(self.step)))
@@ -317,6 +319,34 @@ def test_the_last_steps_keep_the_statistics_of_the_encoder(monkeypatch):
         scales.append(norm.weight.detach().clone())
     assert [not torch.equal(a, b) for a, b in itertools.pairwise(means)] == [True] * 3 + [False] * 3
     assert not any(torch.equal(a, b) for a, b in itertools.pairwise(scales))
+
+
+def test_a_compiled_network_with_another_gradient_is_refused(monkeypatch):
+    """A compiler whose gradient is wrong is named before the first step; one that is right changes no bit."""
+    plain, right, wrong = (plain_trainer(monkeypatch, 2, batch_norm=True) for _ in range(3))
+    factor = []
+
+    @contextlib.contextmanager
+    def uncompiled():
+        factor.append(1.0)
+        yield
+        factor.pop()
+
+    def losses(batch, noise):
+        loss, each = real(batch, noise)
+        return loss * (factor or [1000.0])[-1], each
+
+    monkeypatch.setattr(policy_trainer, "uncompiled", uncompiled)
+    real = wrong.model.losses
+    monkeypatch.setattr(wrong.model, "losses", losses)
+    right._agrees = wrong._agrees = False
+    plain.advance()
+    right.advance()
+    pairs = zip(plain.model.policy.parameters(), right.model.policy.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+    with pytest.raises(ArenaError, match=r"--compile: step 0: the compiled network's gradient .* compiles it wrongly"):
+        wrong.advance()
+    assert wrong.step == 0
 
 
 def test_two_processes_take_the_step_of_one_with_twice_the_batch(monkeypatch):

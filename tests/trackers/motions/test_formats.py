@@ -31,7 +31,7 @@ def motion(ticks: int = 80) -> Clip:
 
 
 def beyond_mimic(clip: Clip, isaac: bool, permute: bool = True) -> dict:
-    """As BeyondMimic writes it: joints and bodies in Isaac Lab's order, or both in MuJoCo's (mjlab)."""
+    """Clips of BeyondMimic: joints and bodies in Isaac Lab's order, or both in MuJoCo's (mjlab)."""
     poses = kinematics.forward(*(torch.from_numpy(x) for x in (clip.root_pos, clip.root_quat, clip.joint_pos)))
     links = [kinematics.link_index(n) for n in kinematics.LINK_NAMES if "hand" not in n]
     if isaac:

@@ -8,11 +8,11 @@ from arena_newton.robot.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator, steer
 
 DT = 0.1
-"""As often as an expert decides [s]."""
+"""Interval at which an expert decides [s]."""
 
 
 def drive(pose, velocity, dt=DT):
-    """A robot that does exactly what it is told."""
+    """A robot that follows its commands exactly."""
     moved = rotate_xy(pose[:, 2], velocity[:, :2]) * dt
     return torch.cat([pose[:, :2] + moved, pose[:, 2:] + velocity[:, 2:] * dt], dim=1)
 

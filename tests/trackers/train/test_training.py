@@ -274,11 +274,11 @@ def test_export_takes_fitting_figures_only(trained, tmp_path):
     figure = {"name": "falls", "bar": "no", "value": "0/8", "verdict": "pass"}
     document = {"options": {"engine": "mujoco", "rollouts": 8}, "trackers": [{"name": "sonic", "figures": [figure]}]}
     for text, words in (
-        ("[1]", "not an evaluation.json"),
+        ("[1]", "holds list, expected an object"),
         ('{"trackers": [{}]}', "not an evaluation.json"),
         (json.dumps(document), "other trackers than twist2"),
-        ("{", "not a readable JSON file"),
-        ("[" * 100_000, "not a readable JSON file"),
+        ("{", "not readable as JSON"),
+        ("[" * 100_000, "not readable as JSON"),
     ):
         metrics.write_text(text)
         with pytest.raises(InputError, match=words):
@@ -429,10 +429,10 @@ def test_a_folder_with_a_training_or_weights_is_left_alone(held, tmp_path):
 
 
 def test_the_end_of_a_time_limit_is_annealed(env):
-    """Towards the end of `--minutes` target KL and entropy coefficient fall to a tenth, without `--settle` not."""
+    """Towards the end of `--minutes` target KL and entropy coefficient fall to a tenth, without `--anneal` not."""
     assert [annealed(elapsed, 0.5) for elapsed in (0.2, 0.75, 0.99)] == pytest.approx([1.0, 0.5, 0.1])
     assert annealed(0.99, 0.0) == 1.0
-    runner = make_runner(env, settle=0.5, desired_kl=0.02, entropy=0.01)
+    runner = make_runner(env, anneal=0.5, desired_kl=0.02, entropy=0.01)
     runner.anneal(0.75)
     assert (runner.alg.desired_kl, runner.alg.entropy_coef) == pytest.approx((0.01, 0.005))
 
@@ -448,7 +448,7 @@ def second_process(arguments):
 
 @pytest.mark.release
 def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
-    """As under torchrun on the CPU: both processes end with the same network and input statistics."""
+    """Both processes of a torchrun on the CPU end with the same network and input statistics."""
     library.save(tmp_path / "library.npz")
     flags = ["--device", "cpu", "--worlds", "2", "--steps", "4", "--iterations", "1", "--no-mirror"]
     flags += ["--library", str(tmp_path / "library.npz"), "--log-dir", str(tmp_path / "run")]
@@ -539,7 +539,7 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
         (["--families", "stnd", "3", "--device", "cpu"], "--families"),
         (["export", str(tmp_path / "none.pt"), "--out", str(tmp_path / "x.safetensors")], "no such checkpoint"),
         (["--device", "cpu", "--start-from", str(tmp_path)], "--start-from"),
-        (["--device", "cpu", "--settle", "0.3"], "--settle"),
+        (["--device", "cpu", "--settle", "0.3"], "--anneal"),
         (["--device", "cpu", "--log-dir", str(tmp_path / "bad.pt" / "x")], "--log-dir"),
     ):
         assert command_line.main(arguments) == 2

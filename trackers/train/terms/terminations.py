@@ -13,7 +13,7 @@ from arena_newton.trackers.train.terms.measurement import TickMeasurement
 __all__ = ["TERMINATIONS", "Bound"]
 
 RECOVERY = 1.5
-"""For this time after a push the feet may leave their reference [s]."""
+"""Time after a push in which the feet may leave their reference [s]."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,243 @@
+"""Audits accuse no honest folder, and find forgeries at the level at which they can be found."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from eval_fakes import FakeEnv, FakePolicy, factories
+from made_folders import stored
+
+from arena_newton import policies
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.records.chain import head
+from arena_newton.eval.records.journal import read_journal
+from arena_newton.eval.workers.shard_merge import merge
+from arena_newton.interfaces import Chunk
+from arena_newton.kernels import tick as codes
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from benchmarks.forgeries import FORGERIES, TABLES, forge, journal_lines, level_of, write_lines
+
+FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "5"]
+FLAGS += ["--tracker", "twist2", "sonic"]
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory):
+    """A run of forty episodes through two trackers, `run`, and its two shards."""
+    folder = tmp_path_factory.mktemp("audit")
+    assert main([*FLAGS, "--out", str(folder / "run")], factories()) == 0
+    for part in ("1/2", "2/2"):
+        assert main([*FLAGS, "--worlds", "3", "--shard", part, "--out", str(folder / part[0])], factories()) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(honest, tmp_path):
+    """A copy of the run, to be changed."""
+    return shutil.copytree(honest / "run", tmp_path / "run")
+
+
+def audit(folder, capsys, *flags):
+    """Exit code of an audit, and its contradictions."""
+    capsys.readouterr()
+    code = main(["audit", str(folder), *flags])
+    found = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  contradiction: ")]
+    return code, found
+
+
+def test_the_head_is_the_same_whoever_played(honest, tmp_path, capsys):
+    """Order, worlds and shards change the links and not the head, which stands in results, tables and reports."""
+    merge([honest / "1", honest / "2"], tmp_path / "m")
+    names = json.loads((honest / "run" / "results.json").read_text())["head"]
+    for name in ("results.json", "table.md", "report.md", "report.html"):
+        texts = [(folder / name).read_text() for folder in (honest / "run", tmp_path / "m")]
+        assert texts[0] == texts[1] and names in texts[0], name
+    links = [[line["previous"] for line in journal_lines(f)] for f in (honest / "run", tmp_path / "m")]
+    assert links[0] != links[1] and audit(tmp_path / "m", capsys, "--head", names) == (0, [])
+    assert {path.name for path in (tmp_path / "m" / "actions").iterdir()} == {"twist2", "sonic"}
+    capsys.readouterr()
+    assert main(["report", str(tmp_path / "m"), "--table"]) == 0
+    assert f"Head of 1 journal: {names}." in capsys.readouterr().out
+    records, _ = read_journal(honest / "run" / "episodes.jsonl")
+    assert head(sorted(records, key=lambda one: one.index)) == names
+
+
+def test_honest_folders_are_not_accused(honest, tmp_path, capsys):
+    """Finished, sharded, resumed and interrupted runs, with errors, without actions and moved, contradict nothing."""
+    flags = ["--task", "football", "--engine", "mujoco", "--repeats", "3", "--no-actions", "--failures"]
+    assert main([*flags[:-1], "--out", str(tmp_path / "bare")], factories()) == 0
+    cut = shutil.copytree(honest / "run", tmp_path / "cut")
+    (cut / "episodes.jsonl").write_bytes(b"".join((cut / "episodes.jsonl").read_bytes().splitlines(True)[:-7]))
+    assert main(["resume", str(cut)], factories()) == 0
+    for one in (honest, tmp_path):
+        code = main(["audit", str(one), "--out", str(tmp_path / "pages")])
+        said = capsys.readouterr().out
+        assert code == 0 and "contradictions 0" in said and "level consistent" in said, said
+    assert "6 episodes cannot be replayed" not in said and "9 episodes cannot be replayed" in said
+    page, content = ((tmp_path / "pages" / f"audit.{end}").read_text() for end in ("md", "json"))
+    assert all(level in page and level in content for level in ("self-reported", "consistent", "replayed", "re-run"))
+
+
+def test_each_tracker_plays_its_own_episodes_again(honest, tmp_path, capsys):
+    """A replay of a run through two trackers meets all of its lines; one without actions has nothing to play."""
+    assert main(["audit", str(honest / "run"), "--all"], factories()) == 0
+    assert "replayed 40 of 40, contradictions 0" in capsys.readouterr().out
+    bare = shutil.copytree(honest / "run", tmp_path / "bare", ignore=shutil.ignore_patterns("actions"))
+    assert main(["audit", str(bare), "--replay", "2"], factories()) == 0
+    assert "replayed 0 of 40" in capsys.readouterr().out
+
+
+def test_older_journals_are_marked(tmp_path, capsys):
+    """A folder of every older version is read and reported as unchained."""
+    for schema in (1, 2):
+        code = main(["audit", str(stored(schema, tmp_path / str(schema)))])
+        said = capsys.readouterr().out
+        assert code == 0 and "head unchained" in said and "Unchained: a line was written by a version" in said, said
+
+
+def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
+    """A folder without a run, and a journal that is none, are refused in a line."""
+    assert main(["audit", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path}: no results folder (it has no config.json)\n"
+
+
+REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
+REPLAYED |= {"a failure made a success", "every failure made a success"}
+LEVEL = dict.fromkeys(REPLAYED, "replay")
+LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
+"""What finds a forgery, where lines alone do not; the world of these tests heeds no action."""
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_forgeries_are_found(folder, name):
+    """A forger who makes links and tables again is found by the lines, by a replay or by the published head."""
+    published = json.loads((folder / "results.json").read_text())["head"]
+    forge(folder, FORGERIES[name], tables=name not in TABLES)
+    level, found = level_of(folder, published, factories=factories())
+    assert bool(found) and level == LEVEL.get(name, "lines"), found
+
+
+class Other(FakePolicy):
+    """A policy that decides otherwise; recordings are played as they are."""
+
+    def act(self, observation):
+        chunk = super().act(observation)
+        return chunk if self.name.startswith("replay:") else Chunk(chunk.actions + 0.5)
+
+
+class Losing(FakeEnv):
+    """A world in which nobody succeeds."""
+
+    def step(self, action, worlds=None):
+        status = super().step(action, worlds)
+        return np.where(status == codes.SUCCESS, codes.FALL, status)
+
+
+def test_another_policys_actions_are_found(honest, capsys):
+    """The policy is asked again at its own queries: the run's own decides as recorded, another one is found."""
+    asked = ["audit", str(honest / "run"), "--replay", "6", "--draw", "7", "--policy", "stand"]
+    assert main(asked, factories()) == 0
+    said = capsys.readouterr().out
+    assert "level re-run" in said and "actions are equal to the bit" in said and "47% if 10% are forged" in said
+    assert main([*asked, "--tolerance", "0.4"], factories(policy=Other)) == 1
+    said = capsys.readouterr().out
+    assert said.count("at tick 0 the policy decides otherwise; actions differ by up to 0.5") == 6
+    assert main([*asked, "--tolerance", "0.5"], factories(policy=Other)) == 0
+
+
+def test_a_rate_that_new_seeds_do_not_have_is_found(honest, capsys):
+    """New episodes on seeds of the auditor: the claimed rate is confirmed, one that is far off contradicts."""
+    fresh = ["audit", str(honest / "run"), "--policy", "stand", "--fresh", "100"]
+    assert main(fresh, factories()) == 0
+    said = capsys.readouterr().out
+    assert said.count("Fresh episodes: ") == 4 and "level consistent" in said and "fresh 400" in said
+    assert main(fresh, factories(env=Losing)) == 1
+    assert "0 of 100 succeed on group seed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "flags", [("--policy", "stand"), ("--fresh", "3"), ("--tolerance", "-1"), ("--replay", "-1"), ("--fresh", "-1")]
+)
+def test_flags_that_do_nothing_are_refused(honest, capsys, flags):
+    """A flag that lacks its other one, or is out of range, is a line and code 2."""
+    assert main(["audit", str(honest / "run"), *flags], factories()) == 2
+    assert capsys.readouterr().err.startswith(f"error: {flags[0]}")
+
+
+@pytest.mark.parametrize(
+    ("change", "number"),
+    [
+        (lambda lines: lines[4].update(finished_at="2026-01-01"), 6),
+        (lambda lines: lines.pop(4), 5),
+        (lambda lines: lines[9].pop("previous"), 10),
+    ],
+    ids=["changed", "dropped", "unlinked"],
+)
+def test_a_broken_link_is_named(folder, capsys, change, number):
+    """A line that was changed or dropped without its links breaks the next one, whatever it says."""
+    lines = journal_lines(folder)
+    change(lines)
+    write_lines(folder, lines, link=False)
+    code, found = audit(folder, capsys)
+    assert code == 1 and any(f"line {number} is not linked to line {number - 1}: " in line for line in found), found
+
+
+class Seeing(FakePolicy):
+    """A policy that stands, sees a small picture, and moves its first joint by how bright that is."""
+
+    needs_image = True
+    camera = CameraConfig(width=32, height=24, fit="native")
+    chunk_size = 4
+
+    def act(self, observation):
+        actions = torch.tensor(STAND_ACTION).repeat(len(observation.mask), self.chunk_size, 1)
+        actions[:, :, ACTION["joint_pos"].start] += observation.image.float().mean(dim=(1, 2, 3))[:, None] / 2550
+        return Chunk(actions)
+
+
+def test_pictures_are_drawn_again(parts, tmp_path, capsys):
+    """A replay draws with its stored camera what the policy was shown; a policy that was shown more is found."""
+    made = dataclasses.replace(
+        parts, policy=lambda spec, **options: (policies.get if spec.startswith("replay") else Seeing)(spec, **options)
+    )
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "mujoco", "--repeats", "2", "--seeds", "0"]
+    assert main([*flags, "--out", str(tmp_path / "run")], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all", "--policy", "stand"], made) == 0
+    assert "level re-run" in capsys.readouterr().out
+    forge(tmp_path / "run", lambda folder, lines: shown_otherwise(folder))
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 1
+    assert capsys.readouterr().out.count("shown is") == 2
+
+
+def shown_otherwise(folder):
+    """The policy is said to have had another camera."""
+    content = json.loads((folder / "config.json").read_text())
+    content["environments"]["football twist2 base"]["cameras"]["front"]["width"] = 28
+    (folder / "config.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
+    """States that engine warp recorded follow from each other on engine mujoco; a step aside between two is found."""
+    run, bare = tmp_path / "run", tmp_path / "bare"
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "warp", "--device", "cpu", "--seeds", "0"]
+    flags += ["--repeats", "2", "--worlds", "2"]
+    assert main([*flags, "--out", str(bare)], parts) == 0
+    assert main([*flags, "--record", "--record-cameras", "--out", str(run)], parts) == 0
+    assert main(["audit", str(bare), "--all"], parts) == 2
+    assert "ticks are checked one by one where states were recorded (--record)" in capsys.readouterr().err
+    assert main(["audit", str(run), "--all"], parts) == 0
+    said = capsys.readouterr().out
+    assert "level replayed" in said and "each tick was checked on mujoco" in said
+    path = next((run / "episodes").glob("*repeat0000.npz"))
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["arena_qpos"][7:, 0] += 0.05
+    np.savez_compressed(path, **arrays)
+    assert main(["audit", str(run), "--all"], parts) == 1
+    (found,) = (line for line in capsys.readouterr().out.splitlines() if "contradiction: " in line)
+    assert "the state after tick 6 is 0.05 m from what mujoco gives" in found
