@@ -34,7 +34,7 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecord, write_atomic
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.messages import Built, Done, Ended, Event, Opened, Ticks
+from arena_newton.eval.workers.messages import ActionFile, Built, Done, Ended, Event, Opened, Ticks
 from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 from arena_newton.files.text import plain_text
 from arena_newton.robot.g1 import TICK
@@ -220,6 +220,8 @@ class DealtRun:
             assignment.built = True
         elif isinstance(message, Ticks):
             self.shown.tick(message.count)
+        elif isinstance(message, ActionFile):
+            self.folder.keep_file(message.name, message.content)
         elif isinstance(message, Ended):
             self._keep(assignment, EpisodeRecord.from_json(f"a process of {self.pool.backend.flag}", message.line))
         elif isinstance(message, Lost):
