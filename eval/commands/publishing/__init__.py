@@ -1,0 +1,1 @@
+"""Commands that check, pack and publish results."""
