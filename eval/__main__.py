@@ -1,7 +1,6 @@
 """Command line of the benchmark: ``python -m arena_newton.eval [run|resume|merge|report|bench|certify|list] ...``.
 
-A command is its row here and its file in `eval/commands`, which loads when it is called; those that publish results are
-in `publishing` there.
+A command is its row here and its file in `eval/commands`, which loads when it is called.
 """
 
 from __future__ import annotations
@@ -32,27 +31,14 @@ COMMANDS = {
     ),
     "record": CommandRow("record demonstrations for datasets, or more cameras with --from <out>"),
     "report": CommandRow("write tables and report again from the journal; one table of several runs", *RUNS),
-    "audit": CommandRow(
-        "check results: lines, links, actions and tables of a folder against each other",
-        *RUNS,
-        "commands.publishing.audit:run",
-    ),
-    "bundle": CommandRow(
-        "make an entry of the leaderboard from a run", "<out>", RUNS[1], "commands.publishing.bundle:run"
-    ),
+    "audit": CommandRow("check results: lines, links, actions and tables of a folder against each other", *RUNS),
+    "bundle": CommandRow("make an entry of the leaderboard from a run", "<out>", RUNS[1]),
     "leaderboard": CommandRow(
-        "check the entries of the leaderboard and write its pages",
-        "build [<entry> ...]",
-        "what to do, build",
-        "commands.publishing.leaderboard:run",
+        "check the entries of the leaderboard and write its pages", "build [<entry> ...]", "what to do, build"
     ),
     "film": CommandRow("one success per task as a film or a picture", *RUNS),
     "tables": CommandRow("the paper's tables from suites and runs, next to the paper's numbers", *RUNS),
-    "reproductions": CommandRow(
-        "the paper's numbers, each next to ours, with the mark that intervals allow",
-        *RUNS,
-        "commands.publishing.reproductions:run",
-    ),
+    "reproductions": CommandRow("the paper's numbers, each next to ours, with the mark that intervals allow", *RUNS),
     "compare": CommandRow("compare policies by their episodes: tests, intervals, who won which", *RUNS),
     "tsne": CommandRow(
         "map what one policy answers to the observations of two datasets", extras={"plots": (), "data": ("pyarrow",)}
@@ -61,7 +47,6 @@ COMMANDS = {
         "make a trained policy the one that ships: half precision, a card, 32 MB",
         "<checkpoint>",
         "the checkpoint, or the folder of a training",
-        "commands.publishing.pack:run",
     ),
     "list": CommandRow("show the plan of a run, run nothing"),
     "loop": CommandRow("record, build, train, evaluate, report: the whole loop"),

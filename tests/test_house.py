@@ -49,7 +49,7 @@ STARTS = (
 STARTS += ("trackers.train.__main__", "trackers.motions.__main__", "usd_scenes.__main__")
 STARTS += ("policies.train.__main__",)
 STARTS += ("trackers.tracker_check", "policies.policy_check", "policies.teleop.__main__", "policies.serve.__main__")
-STARTS += tuple(f"eval.{(row.work or f'commands.{name}:run').partition(':')[0]}" for name, row in COMMANDS.items())
+STARTS += tuple(f"eval.commands.{name}" for name in COMMANDS)
 """Modules whose `--help` answers in half a second: these, and what they import at their top, import nothing heavy."""
 PLANNING = ("eval.plan.config", "eval.folders.run_folder", *(f"tasks.{name}" for name in tasks.names()))
 """Modules that expand and check a plan: `eval list` and the refusal of a wrong flag answer at once too. Tasks are
@@ -424,8 +424,8 @@ def test_a_stem_names_one_thing():
     """Two modules have one name only where a table says why."""
     homes = collections.defaultdict(list)
     for module in known().values():
-        named = module.name.startswith(f"{PACKAGE}.eval.commands.")  # a command's file has the name of what it calls
-        if not module.path.stem.startswith("__") and not named:
+        named = f"{PACKAGE}.eval.commands.{module.path.stem}"  # a command's file has the name of what it calls
+        if not module.path.stem.startswith("__") and module.name != named:
             homes[module.path.stem].append(module)
     doubled = {stem: found for stem, found in homes.items() if len(found) > 1}
     report([place(m, 1) for stem, found in doubled.items() if stem not in STEMS for m in found])

@@ -1,1 +1,0 @@
-"""Commands that check, pack and publish results."""
