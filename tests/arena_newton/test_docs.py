@@ -1,6 +1,9 @@
 """The documentation's examples run, and the names in it exist."""
 
+import html
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +39,30 @@ def test_links_lead_somewhere(page):
             other = (page.parent / file).resolve() if file else page
             assert other.exists(), target
             assert not heading or heading in anchors(other), target
+
+
+@pytest.mark.release
+def test_the_site(tmp_path):
+    """The site builds without a warning, and has every page, the glossary's rows, the examples and the public names."""
+    pytest.importorskip("sphinx", reason="needs the extra [docs]: sphinx is not installed")
+    command = [sys.executable, str(ROOT / "docs" / "build.py"), "--out", str(tmp_path)]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    listed = (tmp_path / "llms.txt").read_text()
+    pages = [page.relative_to(ROOT).with_suffix(".html") for page in DOCS]
+    assert all(f"({page})" in listed and (tmp_path / page).is_file() for page in pages)
+
+    def text(page: str) -> str:
+        return html.unescape(re.sub(r"<[^>]+>", "", (tmp_path / page).read_text()))
+
+    rows = (ROOT / "CONTRIBUTING.md").read_text().split("## Glossary")[1].split("\n\n")[2].splitlines()[2:]
+    cells = [re.sub(r"[`*]", "", cell.strip()) for row in rows for cell in row.strip("|").split("|")]
+    assert len(rows) > 30 and [cell for cell in cells if cell not in text("docs/glossary.html")] == []
+    examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
+    assert all(f"python examples/{name}.py" in text(f"examples/{name}.html") for name in examples)
+    assert {path.stem for path in (tmp_path / "examples").glob("*.html")} == examples | {"index"}
+    public = (tmp_path / "api" / "arena_newton.html").read_text()
+    assert all(f'id="arena_newton.{name}"' in public for name in ("ArenaEnv", "ArenaEnv.step", "Rollout.run"))
 
 
 def test_commands_of_the_index_exist():
