@@ -14,7 +14,7 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.leaderboard.entry_file import Entry
+from arena_newton.eval.leaderboard.entry_file import BoardEntry
 
 ROOT = Path(__file__).resolve().parents[3]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
@@ -120,7 +120,7 @@ def test_an_entry_without_a_key_or_file_is_refused(entry, capsys):
     """Each key without a default is asked for by name; files that are missing or no TOML are named."""
     path = entry / "entry.toml"
     text = path.read_text()
-    required = [one for one in Entry.__dataclass_fields__ if one not in ("numbers", "rows", *vars(Entry))]
+    required = [one for one in BoardEntry.__dataclass_fields__ if one not in ("numbers", "rows", *vars(BoardEntry))]
     for key in required:
         path.write_text(re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE))
         code, said, _ = build(entry, capsys)
