@@ -154,8 +154,9 @@ def won(members):
         (lambda entry: (entry / "bundle.zip").write_bytes(b"other"), "SHA-256 is"),
         (lambda entry: fill(entry, trackers=["twist2"]), "trackers are twist2, its numbers have sonic twist2"),
         (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
+        (lambda entry: fill(entry, numbers="paper", rows=["act"]), "numbers of paper are not those of its bundle"),
     ],
-    ids=["outcome", "actions", "bytes", "trackers", "weights"],
+    ids=["outcome", "actions", "bytes", "trackers", "weights", "numbers"],
 )
 def test_an_edited_result_is_found(entry, edit, named, capsys):
     """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""
@@ -171,6 +172,15 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         code, said, _ = build(entry, capsys)
         assert code == 2 and "is no file of a bundle" in said, said
         assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+def test_a_bundle_may_be_elsewhere(entry, capsys):
+    """An entry with numbers of a table and the hash of a bundle that is not there is listed, and says so."""
+    fill(entry, numbers="paper", rows=["act"])
+    (entry / "bundle.zip").unlink()
+    code, said, site = build(entry, capsys)
+    assert code == 0 and "is not part of this board" in said
+    assert "is not part of this board" in (site / "ours.html").read_text()
 
 
 def test_text_of_an_entry_stays_text(entry, capsys):
