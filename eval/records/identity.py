@@ -43,6 +43,7 @@ PACKAGE = Path(arena_newton.__file__).resolve().parent
 UNHASHED = (
     "data/checks",
     "data/datasets",
+    "differentiable",
     "eval/adapters",
     "eval/audit",
     "eval/bench",
