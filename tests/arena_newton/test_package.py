@@ -88,16 +88,19 @@ def test_dependencies_have_both_ends_and_a_tested_version():
 
 
 def test_the_package_says_what_it_is():
-    """Types are offered to checkers, the citation names version and paper, and the console script is declared."""
+    """Types are offered to checkers, package and citation name one version, and the console script is declared."""
+    import arena_newton
+
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (ROOT / "arena_newton" / "py.typed").read_bytes() == b""
+    assert arena_newton.__version__ == project["version"]
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"version: {project['version']}" in citation and "2606.17833" in citation
     assert project["scripts"] == {"arena-newton": "arena_newton.__main__:main"}
 
 
 def test_the_container_is_pinned_and_has_no_root():
-    """The Dockerfile has known instructions, pins what it installs as the project does, and ends as an ordinary user."""
+    """The Dockerfile has known instructions, pins what it installs as the project does, and ends as a plain user."""
     text = re.sub(r"^#.*\n", "", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE)
     steps = [line.split(maxsplit=1) for line in text.replace("\\\n", " ").splitlines() if line]
     assert {name for name, _ in steps} <= {"FROM", "RUN", "COPY", "USER", "WORKDIR", "ENTRYPOINT", "CMD"}
