@@ -32,8 +32,13 @@ COMMANDS = {
     "record": CommandRow("record demonstrations for datasets, or more cameras with --from <out>"),
     "report": CommandRow("write tables and report again from the journal; one table of several runs", *RUNS),
     "audit": CommandRow("check results: lines, links, actions and tables of a folder against each other", *RUNS),
+    "bundle": CommandRow("make an entry of the leaderboard from a run", "<out>", RUNS[1]),
+    "leaderboard": CommandRow(
+        "check the entries of the leaderboard and write its pages", "build [<entry> ...]", "what to do, build"
+    ),
     "film": CommandRow("one success per task as a film or a picture", *RUNS),
     "tables": CommandRow("the paper's tables from suites and runs, next to the paper's numbers", *RUNS),
+    "reproductions": CommandRow("the paper's numbers, each next to ours, with the mark that intervals allow", *RUNS),
     "compare": CommandRow("compare policies by their episodes: tests, intervals, who won which", *RUNS),
     "tsne": CommandRow(
         "map what one policy answers to the observations of two datasets", extras={"plots": (), "data": ("pyarrow",)}

@@ -32,7 +32,7 @@ ROOMS |= dict.fromkeys(OUTSIDE, 6)
 reads their files with their checks, which load a scene to look at it."""
 INNER = {
     f"{PACKAGE}.eval": """records | statistics | plan | folders | reports | play | adapters workers | suites | tables
-        | audit certification studies loop bench | commands | __main__""",
+        | audit certification studies loop bench | leaderboard | commands | __main__""",
     f"{PACKAGE}.eval.certification": """certify_options stand_ins | context | finding | claims | checks
         | certificate jobs | certify""",
     PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets

@@ -49,6 +49,7 @@ UNHASHED = (
     "eval/certification",
     "eval/commands",
     "eval/folders",
+    "eval/leaderboard",
     "eval/loop",
     "eval/records",
     "eval/reports",

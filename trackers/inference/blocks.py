@@ -43,10 +43,11 @@ _PROBE_SEED = 20240
 Network = Callable[[torch.Tensor], torch.Tensor]
 
 
-def session_options() -> onnxruntime.SessionOptions:
-    """Options of a session on one thread that does not write to the screen."""
+def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
+    """Options of a session on some threads that does not write to the screen; a thread that waits takes no core."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4
     return options
 
@@ -54,9 +55,21 @@ def session_options() -> onnxruntime.SessionOptions:
 class OnnxProduct:
     """A network in ONNX Runtime: rows in, rows out."""
 
-    def __init__(self, session: onnxruntime.InferenceSession):
-        """Make one of a session with one input, `obs`, and one output, `action`."""
-        self._session = session
+    def __init__(self, graph: bytes, threads: int = 1):
+        """Make one of a file with one input, `obs`, and one output, `action`, on some threads."""
+        self._session = onnxruntime.InferenceSession(
+            graph, session_options(threads), providers=["CPUExecutionProvider"]
+        )
+        self._graph, self._threads = graph, threads
+        self._others: dict[int, OnnxProduct] = {}
+
+    def on(self, threads: int) -> OnnxProduct:
+        """The network on a number of threads, which changes no bit; each number holds the weights once more."""
+        if threads == self._threads:
+            return self
+        if threads not in self._others:
+            self._others[threads] = OnnxProduct(self._graph, threads)
+        return self._others[threads]
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
         """Outputs of any number of rows; a new tensor."""
@@ -100,11 +113,7 @@ def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-
                 network.eval(), (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
                 dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
             )  # fmt: skip
-            session = onnxruntime.InferenceSession(
-                file.getvalue(), session_options(), providers=["CPUExecutionProvider"]
-            )
-
-            run = OnnxProduct(session)
+            run = OnnxProduct(file.getvalue())
             torch.testing.assert_close(run(probe), network(probe), rtol=rtol, atol=atol)
     except Exception as error:  # exporter and runtime raise classes of their own
         reason = " ".join(str(error).split())[:160]

@@ -164,13 +164,14 @@ def test_declared_spreads_are_those_of_the_page():
 
 
 def test_pages_of_results_are_those_of_their_records(tmp_path, monkeypatch):
-    """findings.md and the table of findings in the results' README are what the command makes of the stored cells."""
+    """The findings, their table in the results' README and the reproductions are what is made of the stored cells."""
     shutil.copy(RESULTS / "README.md", tmp_path)
     monkeypatch.chdir(RESULTS.parents[1])
     files = sorted(str(path.relative_to(RESULTS.parents[1])) for path in RESULTS.glob("cells*.csv"))
     files.remove("docs/results/cells_second.csv")  # other trainings of the same names
     assert main(["tables", *files, "--findings", "--out", str(tmp_path)]) == 0
-    for name in ("README.md", "findings.md"):
+    assert main(["reproductions", files[0], "--out", str(tmp_path)]) == 0
+    for name in ("README.md", "findings.md", "reproductions.md"):
         assert (tmp_path / name).read_text() == (RESULTS / name).read_text(), name
     text = (RESULTS / "README.md").read_text()
     assert text.count(BEGIN) == text.count(END) == 1 and semantic_note() in text

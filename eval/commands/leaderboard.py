@@ -1,0 +1,81 @@
+"""`python -m arena_newton.eval leaderboard build`: entries checked, and published as one site of static pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arena_newton.errors import InputError
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+
+__all__ = ["LeaderboardOptions", "run"]
+
+
+@dataclass(frozen=True)
+class LeaderboardOptions:
+    """Check entries of the leaderboard by schema and audit, and write a site that opens from a disk.
+
+    Without names all entries in leaderboard/ are checked. Exit code 1 where something contradicts, a line for each
+    contradiction; then no page is written.
+    """
+
+    out: str = "site"
+    """Folder of the site; its first page is index.html."""
+    replay: int = 0
+    """Play so many episodes of each run again, of those whose actions are in its bundle."""
+    draw: int = 0
+    """Number of your own by which, with the head, they are drawn."""
+
+
+def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factories | None = None) -> int:
+    """Check, print, and write the site.
+
+    Returns:
+        0: nothing contradicts. 1: something does.
+
+    Raises:
+        InputError: An entry is unfit, or there is none.
+        StorageError: A page cannot be written.
+    """
+    import tempfile
+
+    from arena_newton.cli.flags import check_least, user_path
+    from arena_newton.eval.leaderboard.checked_entry import check_entry
+    from arena_newton.eval.leaderboard.entry_file import ENTRY_FILE
+    from arena_newton.eval.leaderboard.site import write_site
+    from arena_newton.eval.records.journal import StorageError
+    from arena_newton.files.text import counted
+
+    check_least(options, 0, "replay")
+    action, *named = folders
+    if action != Path("build"):
+        raise InputError(f"leaderboard {action}: unknown, known is build")
+    entries = named or sorted(path.parent for path in Path("leaderboard").glob(f"*/{ENTRY_FILE}"))
+    if not entries:
+        raise InputError(f"leaderboard: no {ENTRY_FILE} in leaderboard/*; name the folders of entries")
+    if len({entry.name for entry in entries} | {"index"}) <= len(entries):
+        raise InputError(f"leaderboard: two entries of one name, or one named index: {' '.join(map(str, entries))}")
+    out = user_path(options.out)
+    with tempfile.TemporaryDirectory() as scratch:
+        found = []
+        for folder in entries:
+            into = Path(scratch) / folder.name
+            one = check_entry(folder, into, replays=options.replay, draw=options.draw, factories=factories)
+            found.append(one)
+            print(f"{folder}: {one.entry.level}, {counted(len(one.rates), 'rate')}")
+            for fault in one.faults:
+                print(f"  contradiction: {fault}")
+            for note in one.notes:
+                print(f"  {note}")
+        if any(one.faults for one in found):
+            return 1
+        try:
+            write_site(found, entries, out)
+        except OSError as error:
+            raise StorageError(f"--out {out}: cannot be written ({error.strerror})") from None
+    print(f"site: {out / 'index.html'}")
+    return 0

@@ -1,0 +1,137 @@
+"""Entries of the leaderboard with their numbers: bundles audited, and everything that an entry says held to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from arena_newton.errors import InputError
+from arena_newton.eval.audit.folder_audit import Audit, audited, runs_in
+from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, Entry, read_entry
+from arena_newton.eval.leaderboard.result_bundle import unpack
+from arena_newton.eval.records.chain import joint_head
+from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.tables.condition_rates import (
+    ConditionRate,
+    rate_of_cell,
+    rates_of_paper,
+    rates_of_published,
+)
+from arena_newton.eval.tables.episode_table import EvaluatedCell
+from arena_newton.eval.tables.evaluated_cells import read_cells
+from arena_newton.eval.tables.paper_numbers import FAMILIES, published
+from arena_newton.files.stored_json import shown
+
+if TYPE_CHECKING:
+    from arena_newton.eval.play.run import Factories
+
+__all__ = ["CheckedEntry", "check_entry"]
+
+
+@dataclass
+class CheckedEntry:
+    """An entry, its numbers, and what its check found."""
+
+    name: str
+    """Name of its folder."""
+    entry: Entry
+    rates: list[ConditionRate] = field(default_factory=list)
+    audits: list[Audit] = field(default_factory=list)
+    """Of each run of its bundle."""
+    faults: list[str] = field(default_factory=list)
+    """Contradictions, a sentence each."""
+    notes: list[str] = field(default_factory=list)
+
+
+def check_entry(
+    folder: Path, into: Path, *, replays: int = 0, draw: int = 0, factories: Factories | None = None
+) -> CheckedEntry:
+    """Read an entry, audit its bundle, and gather its numbers.
+
+    Args:
+        folder: Folder of the entry.
+        into: Empty folder for its bundle.
+        replays: Episodes of each run to play again, where their actions are there.
+        draw: Number by which they are drawn.
+        factories: What worlds and trackers are made with; the real ones by default.
+
+    Raises:
+        InputError: Its file is unfit, or numbers or bundle are missing or cannot be read.
+    """
+    checked = CheckedEntry(folder.name, read_entry(folder))
+    entry, where = checked.entry, f"{checked.name}/{ENTRY_FILE}"
+    at_hand = bool(entry.bundle) and (entry.own or (folder / BUNDLE_FILE).exists())
+    if at_hand:
+        checked.faults += filter(None, [unpack(folder / BUNDLE_FILE, entry.bundle, into)])
+        cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
+        checked.rates += map(rate_of_cell, cells)
+        weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
+        if cells and entry.checkpoint != weights:
+            checked.faults.append(f"{where}: checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}")
+    elif entry.bundle:
+        checked.notes.append(f"Its bundle, SHA-256 {entry.bundle}, is not part of this board: see its source.")
+    if checked.faults:
+        return checked
+    if not entry.own:
+        stated = _stated(folder, entry)
+        if at_hand and _counts(stated) != _counts(checked.rates):
+            checked.faults.append(f"{where}: numbers of {entry.numbers} are not those of its bundle")
+        checked.rates = checked.rates or stated
+    played = sorted({one for rate in checked.rates for one in rate.tracker.split("+")})
+    if played != sorted(entry.trackers):
+        checked.faults.append(f"{where}: trackers are {' '.join(entry.trackers)}, its numbers have {' '.join(played)}")
+    return checked
+
+
+def _audit(
+    checked: CheckedEntry, root: Path, replays: int, draw: int, factories: Factories | None
+) -> Sequence[EvaluatedCell]:
+    """Audit every run of an unpacked bundle; its cells."""
+    folders = runs_in(root)
+    for folder in folders:
+        audit = audited(folder)
+        if replays:
+            from arena_newton.eval.audit.action_replay import drawn, replay  # loads the simulator
+
+            replay(audit, drawn(audit, replays, draw), factories)
+        checked.audits.append(audit)
+        checked.faults += [fault.replace(f"{root}/", f"{checked.name}/") for fault in audit.faults]
+        checked.notes += [note.replace(f"{root}/", f"{checked.name}/") for note in audit.notes]
+    found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
+    if found != (said := checked.entry.head):
+        checked.faults.append(f"{checked.name}/{ENTRY_FILE}: head is {shown(said)}, its runs have {shown(found)}")
+    if checked.faults:
+        return []
+    cells = read_cells([root] if (root / SUITE_FILE).exists() else folders)
+    checked.faults += cells.changed
+    return [cell for cell in cells.cells if cell.latency == 0 and cell.records]
+
+
+def _counts(rates: Sequence[ConditionRate]) -> set[tuple[object, ...]]:
+    return {(*one.row, one.task, len(one.held or ()), sum((one.held or {}).values())) for one in rates}
+
+
+def _stated(folder: Path, entry: Entry) -> list[ConditionRate]:
+    """Numbers of an entry without runs: the paper's, published ones, or those of a `cells.csv`.
+
+    Raises:
+        InputError: A row is not known, or the file is missing or damaged.
+    """
+    if entry.numbers == "paper":
+        known = list(FAMILIES.values())
+        found = [rate for row in entry.rows if row in known for rate in rates_of_paper(row)]
+    elif entry.numbers == "published":
+        known = [one.policy for one in published()]
+        found = [rate for one in published() if one.policy in entry.rows for rate in rates_of_published(one)]
+    else:
+        cells = read_cells([folder / entry.numbers]).cells
+        known = list(dict.fromkeys(cell.policy for cell in cells))
+        found = [rate_of_cell(cell) for cell in cells if cell.policy in entry.rows]
+    for row in entry.rows:
+        if row not in known:
+            raise InputError(
+                f"{folder / ENTRY_FILE}: rows: {shown(row)} is not in {entry.numbers}, known are {' '.join(known)}"
+            )
+    return found

@@ -1,0 +1,94 @@
+"""The file `entry.toml` of an entry of the leaderboard, read and held to its fields."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from arena_newton.errors import InputError
+from arena_newton.eval.audit.folder_audit import CONSISTENT, LEVELS, SELF_REPORTED
+from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
+from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, loaded, read_regular
+from arena_newton.files.text import is_printable, plain_text
+
+__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "Entry", "read_entry"]
+
+ENTRY_FILE = "entry.toml"
+BUNDLE_FILE = "bundle.zip"
+"""Runs of an entry, next to its file."""
+
+Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(re.fullmatch(r"\d{4}-\d\d(?:-\d\d)?", v)))]
+Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]
+Level = Annotated[str, Known(lambda: tuple(LEVELS))]
+Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v))]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Statements of an entry about itself, a key of `entry.toml` each."""
+
+    name: Name
+    """Policy as the board names it."""
+    authors: Name
+    date: Date
+    source: Name
+    """Address of code or publication, or the command that plays it."""
+    simulator: Name
+    training_data: Literal["none", "scripted", "teleoperated", "other"]
+    """Demonstrations by whom; `none`: nothing was trained."""
+    training: Name
+    """Data and training in a sentence."""
+    trackers: tuple[Name, ...]
+    """Trackers that executed the policy."""
+    hardware: Name
+    """Machine of the evaluation."""
+    level: Level
+    """Level to which a maintainer checked it."""
+    numbers: Name = "bundle"
+    """Source of its numbers: `bundle`, `paper`, `published`, or the path of a `cells.csv` next to the entry's file."""
+    rows: tuple[Name, ...] = ()
+    """Policies of the paper, of the published rows or of the `cells.csv` whose numbers these are."""
+    checkpoint: Text = ""
+    """Hash of the policy's weights, as its runs give it."""
+    bundle: Hash = ""
+    """SHA-256 of `bundle.zip`."""
+    head: Text = ""
+    """Head of its journals (docs/auditing.md)."""
+    checked: Text = ""
+    """Command and day of the check, by the maintainer who raised the level."""
+
+    @property
+    def own(self) -> bool:
+        """True if the numbers are of runs of this benchmark in a bundle."""
+        return self.numbers == "bundle"
+
+
+def read_entry(folder: Path) -> Entry:
+    """Read the entry of a folder.
+
+    Raises:
+        InputError: The file is missing or no TOML, a key is missing, unknown or unfit, or its level needs what it does
+            not name; the message names file and key.
+    """
+    path = folder / ENTRY_FILE
+    try:
+        content: dict[str, Json] = tomllib.loads(read_regular(path, MAX_CONFIG_BYTES).decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: not readable as TOML ({plain_text(error, 200)})") from None
+    known = [one.name for one in dataclasses.fields(Entry)]
+    for key in content:
+        if key not in known:
+            raise InputError(f"{path}: {plain_text(key, 60)} is not a key of an entry, known are {' '.join(known)}")
+    entry = loaded(str(path), content, Entry)
+    needed = {"trackers": True, "rows": not entry.own, "bundle": entry.own or entry.level != SELF_REPORTED}
+    needed["checked"] = entry.level not in (SELF_REPORTED, CONSISTENT)
+    for key, wanted in needed.items():
+        if wanted and not getattr(entry, key):
+            raise InputError(f"{path}: {key} is empty; level {entry.level} with numbers from {entry.numbers} needs it")
+    return entry

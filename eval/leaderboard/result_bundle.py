@@ -1,0 +1,136 @@
+"""Bundles: the files of results folders that an audit needs, in one archive, packed and unpacked within limits."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from arena_newton.errors import InputError
+from arena_newton.eval.audit.folder_audit import CONSISTENT, audited, runs_in
+from arena_newton.eval.folders.results import RunRecord
+from arena_newton.eval.leaderboard.entry_file import Entry
+from arena_newton.eval.records.chain import joint_head
+from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
+from arena_newton.eval.records.journal import JOURNAL_FILE
+from arena_newton.eval.reports.wording import media_of
+from arena_newton.eval.tables.episode_table import cells_of
+from arena_newton.files.stored_json import read_regular
+from arena_newton.files.untrusted_files import create
+
+__all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strips_of", "unpack"]
+
+MAX_BUNDLE_BYTES = 64 << 20
+MAX_UNPACKED_BYTES = 512 << 20
+MAX_FILES = 10_000
+_WORD = r"[A-Za-z0-9_+][A-Za-z0-9_.+=-]{0,199}"
+_MEMBER = re.compile(
+    rf"(?:{_WORD}/){{0,4}}(?:config\.json|episodes\.jsonl|suite\.json|suite\.{_WORD}\.jsonl"
+    rf"|actions/(?:{_WORD}/)?{_WORD}\.npz|strips/{_WORD}\.(?:jpg|png))"
+)
+"""Paths that a bundle may hold: all of them inside the folder into which it is unpacked."""
+
+
+def made_bundle(folder: Path, actions: int, strips: int) -> tuple[bytes, str]:
+    """Archive of the runs in a folder, the same bytes for the same files, and the `entry.toml` that names it.
+
+    Args:
+        folder: A results folder, a suite, or a folder of several.
+        actions: Episodes of each run whose actions come along; the head of the journal draws them, not the owner.
+        strips: Film strips of each run that come along, at most one of a task and outcome, failures first.
+
+    Returns:
+        The archive, and the text of the entry's file, in which the keys are empty that the author fills in.
+
+    Raises:
+        InputError: There is no run, an audit finds a contradiction, or the bundle would be too large.
+    """
+    from arena_newton.eval.audit.action_replay import drawn  # loads the simulator, which a build does not need
+
+    names = [path for pattern in (SUITE_FILE, "suite.*.jsonl") for path in sorted(folder.glob(pattern))]
+    audits = [audited(inside) for inside in runs_in(folder)]
+    for audit in audits:
+        if audit.faults:
+            raise InputError(f"{audit.faults[0]}; all contradictions: eval audit {folder}")
+        inside = audit.run.folder
+        names += [inside / CONFIG_FILE, inside / JOURNAL_FILE]
+        names += [inside / str((one.media or {})["actions"]) for one in drawn(audit, actions, 0)] if actions else []
+        names += [path for _, path in strips_of(audit.run)][:strips]
+    stream, size = io.BytesIO(), 0
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for path in names:
+            name, data = path.relative_to(folder).as_posix(), read_regular(path, MAX_UNPACKED_BYTES)
+            size += len(data)
+            if not _MEMBER.fullmatch(name):
+                raise InputError(f"{path}: a bundle holds plain names of letters, digits and _ . + = - alone")
+            member = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            member.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(member, data)
+    if stream.tell() > MAX_BUNDLE_BYTES or size > MAX_UNPACKED_BYTES or len(names) > MAX_FILES:
+        raise InputError(f"{folder}: its bundle has {stream.tell():,} bytes, expected at most {MAX_BUNDLE_BYTES:,}")
+    cells = [cell for audit in audits for cell in cells_of(audit.run)]
+    known = {
+        "simulator": "arena_newton",
+        "trackers": sorted({cell.tracker for cell in cells}),
+        "level": CONSISTENT,
+        "checkpoint": " ".join(sorted({cell.weights for cell in cells} - {""})),
+        "bundle": hashlib.sha256(stream.getvalue()).hexdigest(),
+        "head": joint_head([audit.results.get("head") for audit in audits]) or "",
+    }
+    left = {one.name: "" for one in dataclasses.fields(Entry) if one.name not in ("numbers", "rows")}
+    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in (left | known).items()]
+    return stream.getvalue(), "".join(lines)
+
+
+def strips_of(run: RunRecord) -> Iterator[tuple[str, Path]]:
+    """Caption and file of the first film strip of each task and outcome, failures first; only files that are there."""
+    seen = set()
+    for record in sorted(run.records, key=lambda one: (one.outcome == "success", one.index)):
+        path = media_of(record).get("world strip") or media_of(record).get("ego strip")
+        if path is not None and (record.task, record.outcome) not in seen and (run.folder / path).is_file():
+            seen.add((record.task, record.outcome))
+            where = f"{record.task} {record.tracker} {record.mode}, seed {record.group_seed} repeat {record.repeat}"
+            yield f"{where}: {record.outcome}", run.folder / path
+
+
+def unpack(path: Path, digest: str, into: Path) -> str | None:
+    """Unpack a bundle into an empty folder, if it is the one with this hash.
+
+    Args:
+        path: The archive.
+        digest: Its SHA-256.
+        into: The folder.
+
+    Returns:
+        The contradiction as a sentence where it has another hash, and is not unpacked.
+
+    Raises:
+        InputError: It is missing, or no bundle.
+    """
+    try:
+        data = read_regular(path, MAX_BUNDLE_BYTES)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; the entry names its bundle {digest}") from None
+    if (found := hashlib.sha256(data).hexdigest()) != digest:
+        return f"{path}: SHA-256 is {found}, its entry says {digest}"
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if sum(one.file_size for one in members) > MAX_UNPACKED_BYTES or len(members) > MAX_FILES:
+                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED_BYTES:,} bytes or {MAX_FILES:,} files")
+            for one in members:
+                if not _MEMBER.fullmatch(one.filename):
+                    raise InputError(f"{path}: {one.filename[:60]!r} is no file of a bundle")
+                (into / one.filename).parent.mkdir(parents=True, exist_ok=True)
+                with create(into / one.filename) as file:
+                    file.write(archive.read(one))
+    except InputError:
+        raise
+    except Exception as error:  # a damaged archive fails anywhere inside zipfile
+        raise InputError(f"{path}: not readable as an archive ({error})") from None
+    return None

@@ -1,0 +1,227 @@
+"""Leaderboard: entries are held to their schema and their bundles, and the site shows what they say and no more."""
+
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import tomllib
+import zipfile
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from eval_fakes import factories
+
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.leaderboard.entry_file import Entry
+
+ROOT = Path(__file__).resolve().parents[3]
+FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
+FLAGS += ["--tracker", "twist2", "sonic"]
+KEYS = {"name": "Ours", "authors": "We", "date": "2026-11-26", "source": "here", "hardware": "a laptop"}
+KEYS |= {"training_data": "none", "training": "none"}
+
+
+class Page(HTMLParser):
+    """Addresses and tags of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.addresses, self.tags = [], []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for key, value in attrs if key in ("href", "src")]
+
+
+def fill(entry, **keys):
+    """Give keys of an entry's file these values."""
+    path = entry / "entry.toml"
+    content = tomllib.loads(path.read_text()) | keys
+    path.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in content.items()))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """An entry of a run of stand-ins."""
+    folder = tmp_path_factory.mktemp("made")
+    assert main([*FLAGS, "--out", str(folder / "run")], factories()) == 0
+    assert main(["bundle", str(folder / "run"), "--out", str(folder / "ours"), "--actions", "3"]) == 0
+    return folder / "ours"
+
+
+@pytest.fixture
+def entry(made, tmp_path):
+    """A copy of it, filled in, to be changed."""
+    copied = shutil.copytree(made, tmp_path / "ours")
+    fill(copied, **KEYS)
+    return copied
+
+
+def build(entry, capsys, *flags):
+    """Exit code of a build, what it printed, and its site."""
+    capsys.readouterr()
+    site = entry.parent / "site"
+    code = main(["leaderboard", "build", str(entry), "--out", str(site), *flags], factories())
+    said = capsys.readouterr()
+    return code, said.out + said.err, site
+
+
+def repacked(entry, change):
+    """Change the members of a bundle, and its hash in the entry, as a forger does who knows both."""
+    path = entry / "bundle.zip"
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    fill(entry, bundle=hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
+    """Bundle, build and page: rates, replays and the bundle are shown, all links are there; no entry is replaced."""
+    code, said, site = build(entry, capsys, "--replay", "2", "--draw", "7")
+    assert code == 0 and "consistent, 4 rates" in said, said
+    text = (site / "ours.html").read_text()
+    assert "16 episodes, 2 played again, no contradiction" in text
+    assert (site / "ours" / "bundle.zip").read_bytes() == (entry / "bundle.zip").read_bytes()
+    for page in site.glob("*.html"):
+        assert all((site / address).is_file() for address in Page(page).addresses), page
+    assert main(["bundle", str(made.parent / "run"), "--out", str(entry)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("keys", "named"),
+    [
+        ({"name": ""}, 'name is "", expected a name'),
+        ({"date": "yesterday"}, "date is"),
+        ({"training_data": "secret"}, "training_data is"),
+        ({"level": "proved"}, "level is"),
+        ({"trackers": "twist2"}, "trackers is"),
+        ({"bundle": ""}, "bundle is empty"),
+        ({"level": "replayed"}, "checked is empty"),
+        ({"colour": "red"}, "colour is not a key of an entry"),
+        ({"numbers": "paper"}, "rows is empty"),
+        ({"numbers": "paper", "rows": ["gpt"]}, 'rows: "gpt" is not in paper'),
+        ({"numbers": "nothing.csv", "rows": ["act"]}, "nothing.csv: no such file"),
+    ],
+)
+def test_an_unfit_entry_is_refused_by_file_and_key(entry, keys, named, capsys):
+    """A key that is missing, unknown or unfit, or that a level needs, is one line with the file and the key; code 2."""
+    fill(entry, **keys)
+    code, said, _ = build(entry, capsys)
+    assert code == 2 and named in said.splitlines()[-1] and str(entry) in said.splitlines()[-1], said
+
+
+def test_an_entry_without_a_key_or_file_is_refused(entry, capsys):
+    """Each key without a default is asked for by name; files that are missing or no TOML are named."""
+    path = entry / "entry.toml"
+    text = path.read_text()
+    required = [one for one in Entry.__dataclass_fields__ if one not in ("numbers", "rows", *vars(Entry))]
+    for key in required:
+        path.write_text(re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE))
+        code, said, _ = build(entry, capsys)
+        assert code == 2 and f"{path}: {key} is missing" in said, said
+    path.write_text("name = ")
+    assert build(entry, capsys)[0] == 2
+    path.write_text(text)
+    (entry / "bundle.zip").unlink()
+    assert "bundle.zip: no such file" in build(entry, capsys)[1]
+    assert main(["leaderboard", "destroy"]) == 2
+
+
+def won(members):
+    lines = [json.loads(line) for line in members["episodes.jsonl"].splitlines()]
+    line = next(line for line in lines if line["outcome"] != "success")
+    line |= {"outcome": "success", "reason": "success", "margin": 0.3, "progress": 1.0}
+    line["predicates"] = {name: line["steps"] for name in line["predicates"]}
+    line["events"] = [event for event in line["events"] if event["kind"] != "fall"]
+    before, texts = b"", []
+    for one in lines:
+        before = json.dumps(one | {"previous": hashlib.sha256(before).hexdigest()}).encode() + b"\n"
+        texts.append(before)
+    members["episodes.jsonl"] = b"".join(texts)
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        (lambda entry: repacked(entry, won), "head is"),
+        (lambda entry: repacked(entry, lambda m: m.update({sorted(m)[0]: b"x" * 99})), "contradiction"),
+        (lambda entry: (entry / "bundle.zip").write_bytes(b"other"), "SHA-256 is"),
+        (lambda entry: fill(entry, trackers=["twist2"]), "trackers are twist2, its numbers have sonic twist2"),
+        (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
+    ],
+    ids=["outcome", "actions", "bytes", "trackers", "weights"],
+)
+def test_an_edited_result_is_found(entry, edit, named, capsys):
+    """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""
+    edit(entry)
+    code, said, site = build(entry, capsys)
+    assert code == 1 and named in said and not site.exists(), said
+
+
+def test_a_bundle_stays_in_its_folder(entry, capsys):
+    """A member of a bundle with another path or kind is refused, and nothing is written outside."""
+    for name in ("../escaped.json", "/escaped.json", "actions/../../escaped.npz", "run.sh"):
+        repacked(entry, lambda members, name=name: members.update({name: b"{}"}))
+        code, said, _ = build(entry, capsys)
+        assert code == 2 and "is no file of a bundle" in said, said
+        assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+def test_text_of_an_entry_stays_text(entry, capsys):
+    """Hostile words of an entry add no element and no address to the pages."""
+    _, _, site = build(entry, capsys)
+    harmless = [Page(path).tags for path in sorted(site.glob("*.html"))]
+    fill(entry, name="<script>alert(1)</script>", source="<img src=//a.example>", training="{{ 7 * 7 }}\"'><a href=x>")
+    _, _, site = build(entry, capsys)
+    assert [Page(path).tags for path in sorted(site.glob("*.html"))] == harmless
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in (site / "index.html").read_text()
+
+
+def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
+    """The entries in leaderboard/ pass schema and audit, and the board names each."""
+    monkeypatch.chdir(ROOT)
+    assert main(["leaderboard", "build", "--out", str(tmp_path / "site")]) == 0, capsys.readouterr().out
+    text = (tmp_path / "site" / "index.html").read_text()
+    entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
+    assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)
+    for title in ("in-GMT", "in-GMT, other modes", "cross-GMT", "merged"):
+        assert f"<h2>{title}</h2>" in text
+    assert text.index("WB-WAM") < text.index("Diffusion Policy (paper)") and "in Isaac Sim" in text
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PROBE = """<p></p><script>onload = () => { document.querySelector('p').textContent = Array.from(frames).map(frame => {
+const d = frame.document, e = d.documentElement, s = d.querySelector('select[name=tracker]');
+const before = d.querySelector('output').textContent;
+s.value = 'sonic'; s.dispatchEvent(new frame.Event('change'));
+const head = d.querySelectorAll('th')[6]; head.querySelector('button').click();
+const shown = [...head.closest('table').tBodies[0].rows].filter(r => !r.hidden).map(r => r.cells[6].dataset.value);
+return [e.scrollWidth, e.clientWidth, before, d.querySelector('output').textContent, head.ariaSort, shown.join(' ')]
+.join()}).join(';')}</script>"""
+
+
+def test_the_board_in_a_browser(tmp_path, monkeypatch):
+    """In a browser the board filters and sorts, and at 400 and 1280 px nothing is wider than the window."""
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip(f"needs a browser ({', '.join(BROWSERS)}), none is installed")
+    monkeypatch.chdir(ROOT)
+    entries = ["leaderboard/wb_wam", "leaderboard/paper_act", "leaderboard/paper_dp"]
+    assert main(["leaderboard", "build", *entries, "--out", str(tmp_path / "site")]) == 0
+    frames = "".join(f"<iframe src='site/index.html' width={width} height=900></iframe>" for width in (400, 1280))
+    (tmp_path / "probe.html").write_text(frames + PROBE)
+    command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900", "--virtual-time-budget=2000"]
+    command += ["--dump-dom", (tmp_path / "probe.html").as_uri()]
+    page = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    frames = [frame.split(",") for frame in re.search("<p>(.*)</p>", page)[1].split(";")]
+    for width, limit, before, after, sort, values in frames:
+        rates = [float(value) for value in values.split()]
+        assert int(width) <= int(limit) and before != after and before.startswith(before.split()[2]), frames
+        assert sort == "descending" and len(rates) == 3 and rates == sorted(rates, reverse=True)
