@@ -23,7 +23,7 @@ import api_reference
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 READING = {
-    "Start": "docs/index docs/scope docs/faq",
+    "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
     "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
         docs/design/identity""",
     "How-to": """docs/policies docs/serving docs/trackers docs/authoring docs/experts docs/recording docs/datasets
