@@ -43,7 +43,6 @@ PACKAGE = Path(arena_newton.__file__).resolve().parent
 UNHASHED = (
     "data/checks",
     "data/datasets",
-    "differentiable",
     "eval/adapters",
     "eval/audit",
     "eval/bench",
