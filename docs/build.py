@@ -153,7 +153,7 @@ def build(out: Path) -> int:
     """Build the site.
 
     Args:
-        out: Folder of the site; what it holds is replaced.
+        out: Folder of the site; files of the same names are replaced.
 
     Returns:
         0, or 1 if Sphinx warned.
