@@ -20,9 +20,11 @@ FOLDERS = "arena_newton eval policies trackers kernels usd_scenes tests benchmar
 
 
 def test_the_index_names_every_page():
-    """Every page of docs/ is linked from the index."""
+    """Every page of docs/ is linked from the index, and the site has it in its order of reading."""
     linked = set(re.findall(r"\]\(([\w./]+\.md)", (ROOT / "docs" / "index.md").read_text()))
     assert linked >= {str(page.relative_to(ROOT / "docs")) for page in DOCS} - {"index.md"}
+    ordered = set(re.findall(r"[\w/]+", (ROOT / "docs" / "build.py").read_text()))
+    assert ordered >= {str(page.relative_to(ROOT).with_suffix("")) for page in DOCS}
 
 
 def anchors(page: Path) -> set[str]:
