@@ -412,6 +412,9 @@ class Recorder:
     def start(self, env: World, world: int, episode: Any) -> None:
         """An episode begins in a world: it was reset."""
 
+    def query(self, env: World, observation: Observation) -> None:
+        """The policy is asked: by the worlds in the observation's mask, with what they show it."""
+
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """A tick begins.
 

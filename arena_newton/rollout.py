@@ -183,6 +183,8 @@ class Rollout:
     def _ask(self, observation: Observation) -> list[int]:
         """Take new chunks from the policy; ends the episodes for which it has none, and returns their worlds."""
         self._view.refresh()
+        for one in self.recorders:
+            one.query(self.env, observation)
         answer, asks = self.policy.act(observation), observation.mask
         self._take(answer, asks)
         failed = {world: message for world, message in answer.errors.items() if asks[world]}

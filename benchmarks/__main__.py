@@ -17,6 +17,7 @@ from arena_newton.errors import InputError
 from benchmarks.bench_options import (
     CameraBenchOptions,
     DatasetBenchOptions,
+    ForgeryOptions,
     PeerOptions,
     PlainBenchOptions,
     PolicyBenchOptions,
@@ -61,6 +62,7 @@ BENCHES = {
     "generator": Item(RoundsBenchOptions, "single_figures:generator_times", "a tick of the reference generator"),
     "episodes": Item(PlainBenchOptions, "single_figures:episode_times", "60 Football episodes on two cores"),
     "overview": Item(PlainBenchOptions, "single_figures:overview_times", "python -m arena_newton.eval --help"),
+    "forgeries": Item(ForgeryOptions, "forgeries:forgery_figures", "forged results, and what finds each"),
     "tests": Item(PlainBenchOptions, "single_figures:suite_times", "the test suite, kernels cached and not"),
 }
 """Benches by name."""

@@ -10,6 +10,7 @@ from arena_newton.cli.flags import Device, Several, bounds
 __all__ = [
     "CameraBenchOptions",
     "DatasetBenchOptions",
+    "ForgeryOptions",
     "PeerOptions",
     "PlainBenchOptions",
     "PolicyBenchOptions",
@@ -171,3 +172,13 @@ class PeerOptions(PlainBenchOptions):
     """Width and height of the pictures of `camera` [px]."""
     history: str | None = None
     """File to which each pair that was measured is appended as a JSON line."""
+
+
+@dataclass(frozen=True)
+class ForgeryOptions(PlainBenchOptions):
+    """Forge a results folder in fifty ways, and say at which level `eval audit` finds each."""
+
+    folder: str = ""
+    """Honest folder of a run on engine mujoco; copies are forged."""
+    policy: str | None = None
+    """Policy of the folder, to be asked again."""

@@ -11,6 +11,7 @@ __all__ = ["EXTRAS", "require"]
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "data": ("pyarrow", "datasets", "pandas"),
+    "docs": ("sphinx", "myst_parser", "pydata_sphinx_theme"),
     "gr00t": ("zmq", "msgpack"),
     "plots": ("matplotlib", "sklearn"),
     "policies": ("diffusers", "transformers", "scipy"),

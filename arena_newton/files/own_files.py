@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import re
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -31,7 +30,7 @@ def file_label(name: str) -> str:
 
 
 @contextlib.contextmanager
-def replace_atomically(path: str | Path, *, sync: bool = False, shared: bool = False) -> Iterator[BinaryIO]:
+def replace_atomically(path: str | Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file next to `path`: renamed to it at the end of the block, removed on an error.
 
     The folder is made where there is none; links at the temporary name are not followed.
@@ -39,13 +38,12 @@ def replace_atomically(path: str | Path, *, sync: bool = False, shared: bool = F
     Args:
         path: The file to write or to replace.
         sync: Wait until the content is on the disk, so that not even a power failure leaves a part.
-        shared: Others may write the file at the same time: the temporary file is this call's own.
 
     Raises:
         OSError: The file cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(path.name + (f".{uuid.uuid4().hex}" if shared else "") + PARTIAL)
+    temporary = path.with_name(path.name + PARTIAL)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with create(temporary) as file:

@@ -140,6 +140,18 @@ class MujocoPhysics(Physics):
         for target, source in self._copies[w]:
             target[:] = source
 
+    def put(self, world: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Put a world into a state; what its solver starts from stays.
+
+        Args:
+            world: World index.
+            qpos: Positions, shape [nq].
+            qvel: Velocities, shape [nv].
+        """
+        d = self._data[world]
+        d.qpos[:], d.qvel[:] = qpos, qvel
+        self._publish(world, d)
+
     def mj_step_only(self) -> None:
         """See `Physics.mj_step_only`."""
         self._each(self._solve_worlds, np.arange(self.worlds))

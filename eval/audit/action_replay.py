@@ -1,33 +1,51 @@
-"""Episodes of a results folder played again on engine mujoco, from their actions alone, and compared bit for bit."""
+"""Episodes of a results folder played again on engine mujoco, from their actions alone, and compared bit for bit.
+
+What the policy was shown is drawn again at its queries; a policy is asked again there, and its answers are compared.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from arena_newton.errors import InputError
+from arena_newton.eval.audit.asked_again import Answers, AskedAgain, RecordedQueries
 from arena_newton.eval.audit.folder_audit import Audit
-from arena_newton.eval.folders.run_folder import actions_folder, stored_options
-from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain
+from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
+from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.plan.options import Batch, Conditions, RunOptions, Stepping, flags_of
+from arena_newton.eval.plan.options import Batch, Chunks, Conditions, Remote, RunOptions, Stepping, flags_of
 from arena_newton.eval.play.run import Factories, check_parts, make_env
 from arena_newton.eval.play.run_flow import groups
+from arena_newton.eval.records.document import CONFIG_FILE
+from arena_newton.eval.records.identity import differing_key
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
-from arena_newton.files.stored_json import shown
+from arena_newton.files.stored_json import loaded, shown
 from arena_newton.files.text import counted
-from arena_newton.interfaces import EpisodeResult
+from arena_newton.interfaces import EpisodeResult, Recorder
+from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
+from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
 
-__all__ = ["drawn", "replay"]
+__all__ = ["ENGINE", "drawn", "found_probability", "replay", "played", "rollout_flags", "stored_cameras", "through"]
 
 COMPARED = "outcome reason steps margin startup_fall overflow predicates progress events".split()
 """Keys of a line that a replay must give again, numbers to the last bit."""
+EVIDENCE = ("final_state", "shown")
+"""Hashes of a line that it must give again, where the line has them."""
 ENGINE = "mujoco"
-FORGED = 0.1
-"""Fraction of forged lines for which a note says how probably the drawn episodes find one."""
+DECIDED = ("outcome", "reason")
+"""Keys of a line that episodes of another engine must give when each tick is checked from its recorded state."""
+LATE = 2
+"""Ticks by which such an episode may end earlier or later: a force or margin near its bar."""
+FORGED = (0.01, 0.05, 0.1, 0.25)
+"""Fractions of forged lines for which an audit says how probably the drawn episodes find one."""
+MOST_SAMPLES = 4
+"""Most rays per pixel along each axis of a stored camera that is drawn again."""
 
 
 def drawn(audit: Audit, count: int | None, seed: int) -> list[EpisodeRecord]:
@@ -46,76 +64,231 @@ def drawn(audit: Audit, count: int | None, seed: int) -> list[EpisodeRecord]:
     return [candidates[number] for number in sorted(chosen)]
 
 
-def replay(audit: Audit, records: Sequence[EpisodeRecord], factories: Factories | None = None) -> None:
+def found_probability(forged: float, episodes: int) -> float:
+    """Probability that one of so many drawn episodes is of a fraction of forged lines."""
+    return 1.0 - (1.0 - forged) ** episodes
+
+
+def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
+    """Flags by which the episodes of a run are played here with a policy, and flags of more kinds of the run."""
+    more = (Remote,) if policy.startswith("remote:") else ()
+    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds, *more) for name in flags_of(kind))
+    same = {name: getattr(stored, name) for name in (*groups_of, "task", "tracker", "seeds", "repeats", "checkpoint")}
+    return RunOptions(**same | {"policy": policy, "engine": ENGINE, "device": "cpu", "actions": False})
+
+
+def replay(
+    audit: Audit,
+    records: Sequence[EpisodeRecord],
+    factories: Factories | None = None,
+    *,
+    policy: str | None = None,
+    tolerance: float = 0.0,
+    tick_tolerance: float = 0.005,
+) -> None:
     """Play episodes again, and add what differs to the audit's contradictions.
 
     Args:
         audit: Of their folder.
         records: The episodes.
-        factories: What worlds and trackers are made with; the real ones by default.
+        factories: What worlds, trackers and policies are made with; the real ones by default.
+        policy: Spec of a policy to ask again at the recorded queries.
+        tolerance: Largest difference of an action that is still the policy's.
+        tick_tolerance: Largest distance of a body after a tick of another engine [m].
 
     Raises:
-        InputError: They were not played on engine mujoco, are demonstrations, or cannot be played here.
+        InputError: They were played on another engine and no states were recorded, are demonstrations, or cannot be
+            played here.
     """
     run, made = audit.run, factories or Factories()
     stored, where = stored_options(run.folder), f"--replay: {run.folder}"
-    if run.config.get("engine") != ENGINE:
-        raise InputError(f"{where} was played on engine {shown(run.config.get('engine'))}; {ENGINE} alone repeats bits")
+    by_tick = run.config.get("engine") != ENGINE
+    if by_tick and not all(EPISODE in (record.media or {}) for record in records):
+        engine = f"was played on engine {shown(run.config.get('engine'))}, and {ENGINE} alone repeats bits"
+        raise InputError(f"{where} {engine}; ticks are checked one by one where states were recorded (--record)")
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
+    totals = _Totals()
     if records:
-        _play(audit, stored, records, made)
+        _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tick_tolerance=tick_tolerance)
     audit.replayed = len(records)
-    found = 1.0 - (1.0 - FORGED) ** len(records)
-    sure = (
-        "any forged line" if len(records) == len(run.records) else f"one of {FORGED:.0%} forged lines with {found:.0%}"
-    )
+    odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
+    sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
+    if by_tick:
+        audit.notes.append(
+            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. Bodies "
+            f"are {totals.furthest:.2g} m off at most (--tick-tolerance {tick_tolerance:g}), no bit counts."
+        )
+    if policy is not None:
+        audit.asked = len(records)
+        audit.notes.append(
+            f"The policy was asked again: {totals.equal} of {counted(totals.compared, 'action')} are equal to the bit, "
+            f"the largest difference is {totals.largest:.3g} (--tolerance {tolerance:g})."
+        )
 
 
-def _play(audit: Audit, stored: RunOptions, records: Sequence[EpisodeRecord], made: Factories) -> None:
+@dataclass
+class _Totals:
+    """Sums over the episodes of an audit."""
+
+    compared: int = 0
+    """Actions of a policy that was asked again."""
+    equal: int = 0
+    largest: float = 0.0
+    """Largest difference of one."""
+    furthest: float = 0.0
+    """Largest distance of a body after a tick [m]."""
+
+
+def _play(
+    audit: Audit,
+    stored: RunOptions,
+    records: Sequence[EpisodeRecord],
+    made: Factories,
+    policy: str | None,
+    tolerance: float,
+    totals: _Totals,
+    *,
+    by_tick: bool,
+    tick_tolerance: float,
+) -> None:
     """Play these episodes of a folder's plan, and compare each."""
     run, wanted = audit.run, {_key(record): record for record in records}
-    names = (*flags_of(Conditions), *flags_of(Batch), *flags_of(Stepping), "task", "seeds", "repeats", "checkpoint")
-    flags = {name: getattr(stored, name) for name in names} | {"tracker": stored.tracker, "engine": ENGINE}
-    plan = resolve(RunOptions(**flags | {"policy": f"replay:{run.folder / 'actions'}", "actions": False}))
-    installed = plan.identity()
-    for key in ("code", "scenes", "rules_hash"):
-        if installed.get(key) != run.config.get(key):
-            audit.notes.append(f"Replayed with another {key} than the run's: what differs may come of that.")
+    plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
+    _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
+    asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
     for tracker in dict.fromkeys(record.tracker for record in records):
         actions = run.folder / actions_folder(stored.tracker, tracker)
         chosen = tuple(episode for episode in plan.episodes if episode.tracker == tracker and _key(episode) in wanted)
-        own = dataclasses.replace(plan.flags, tracker=(tracker,))
-        config = dataclasses.replace(plan, flags=own, policy=f"replay:{actions}", episodes=chosen)
-        config, policy = check_parts(config, made)
+        config = dataclasses.replace(through(plan, tracker, chosen), policy=f"replay:{actions}")
+        config, player = check_parts(config, made)
+        again: Policy | None = None
         try:
-            for group in groups(chosen).values():
-                env = make_env(config, made, group[0], min(own.worlds, len(group)))
-                try:
-                    results: list[EpisodeResult] = []
-                    Rollout(env, policy, group, max_steps=group[0].max_steps, on_finish=results.append).run()
-                finally:
-                    env.close()
-                for result in results:
-                    _compare(audit, wanted[_key(result.episode)], result)
+            if policy is not None:
+                other, again = check_parts(through(asked, tracker, chosen), made)
+                _note_differences(audit, other, ("policy", "policy_file", "policy_facts", "labels"))
+            for (task, _, mode), group in groups(chosen).items():
+                cameras = stored_cameras(audit, f"{task} {tracker} {mode}") if again is None else other.cameras
+                lines = {episode.index: wanted[_key(episode)] for episode in group}
+                media = {index: line.media or {} for index, line in lines.items()}
+                recorded = {i: RecordedQueries.read(run.folder / files["actions"]) for i, files in media.items()}
+                seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
+                states = StatesAgain({i: run.folder / files.get(EPISODE, "") for i, files in media.items()})
+                recorders = [states, seen] if by_tick else [seen]
+                for result in played(dataclasses.replace(config, cameras=cameras), made, player, group, recorders):
+                    index = result.episode.index
+                    if by_tick:
+                        _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
+                        totals.furthest = max(totals.furthest, *states.differences[index][1:])
+                    else:
+                        _compare(audit, lines[index], result, seen.taken(index)[1])
+                for index, answers in seen.answers.items():
+                    _judge_answers(audit, lines[index], answers, totals)
         finally:
-            policy.close()
+            player.close()
+            if again is not None:
+                again.close()
+
+
+def through(plan: RunConfig, tracker: str, chosen: tuple[Episode, ...]) -> RunConfig:
+    """The part of a plan that one tracker executes."""
+    return dataclasses.replace(plan, flags=dataclasses.replace(plan.flags, tracker=(tracker,)), episodes=chosen)
+
+
+def _judge_answers(audit: Audit, record: EpisodeRecord, answers: Answers, totals: _Totals) -> None:
+    """Add a policy's answers at the queries of an episode to the sums, and what contradicts to the audit."""
+    totals.compared, totals.equal = totals.compared + answers.asked, totals.equal + answers.equal
+    totals.largest = max(totals.largest, answers.largest)
+    where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
+    if answers.error is not None or not answers.asked:
+        cause = answers.error or "its actions do not say when the policy was asked"
+        audit.faults.append(f"{where}: the policy cannot be asked again: {cause}")
+    elif answers.first is not None:
+        differ = f"actions differ by up to {answers.largest:.3g}"
+        audit.faults.append(f"{where}: at tick {answers.first} the policy decides otherwise; {differ}")
 
 
 def _key(one: EpisodeRecord | Episode) -> tuple[object, ...]:
     return one.task, one.tracker, one.mode, one.group_seed, one.repeat
 
 
-def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult) -> None:
+def played(
+    config: RunConfig, made: Factories, policy: Policy, group: Sequence[Episode], recorders: Sequence[Recorder] = ()
+) -> Iterator[EpisodeResult]:
+    """Episodes of one task, tracker and mode, played in an environment of their own, as they end."""
+    env = make_env(config, made, group[0], min(config.flags.worlds, len(group)))
+    try:
+        results: list[EpisodeResult] = []
+        latency = config.flags.latency_ticks
+        Rollout(
+            env,
+            policy,
+            group,
+            recorder=recorders,
+            max_steps=group[0].max_steps,
+            latency=latency,
+            on_finish=results.append,
+        ).run()
+    finally:
+        env.close()
+    yield from results
+
+
+def stored_cameras(audit: Audit, group: str) -> dict[str, CameraConfig]:
+    """Cameras of the policy of a run, by name, as the environment of a group kept them; none for one that did not see.
+
+    Raises:
+        InputError: One is unfit.
+    """
+    where = f"{audit.run.folder / CONFIG_FILE}: environments: {group}: {CAMERAS}"
+    stored = audit.run.document.get("environments", {}).get(group, {}).get(CAMERAS, {})
+    cameras = {}
+    for name, facts in stored.items() if isinstance(stored, dict) else ():
+        one = cameras[name] = loaded(where, facts if isinstance(facts, dict) else {}, CameraConfig)
+        if max(one.width, one.height) > SIZE_LIMITS[1] or not 1 <= one.samples <= MOST_SAMPLES:
+            raise InputError(f"{where}: {shown(facts)}: is larger than a camera of a policy")
+    return cameras
+
+
+def _note_differences(audit: Audit, config: RunConfig, keys: Sequence[str]) -> None:
+    """Say where what is installed or asked here is not what the run names."""
+    here, there = config.identity(), audit.run.config
+    for key in keys:
+        found = differing_key({key: there.get(key)}, {key: here.get(key)})
+        note = f"Replayed with another {key} than the run's: what differs may come of that."
+        if found is not None and note not in audit.notes:
+            audit.notes.append(note)
+
+
+def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str]) -> None:
     """Hold an episode that was played again to its line."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
+    again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)
         if was != (tuple(value) if isinstance(was, tuple) else value):
             where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
             audit.faults.append(f"{where}: {name} is {_short(was)}, its actions give {_short(value)}")
+
+
+def _compare_ticks(
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, differences: Sequence[float], tolerance: float
+) -> None:
+    """Hold an episode of another engine, whose ticks were checked one by one, to its line and recorded states."""
+    where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
+    for name in DECIDED:
+        if (was := getattr(record, name)) != (now := getattr(result, name)):
+            audit.faults.append(f"{where}: {name} is {shown(was)}, its recorded states give {shown(now)}")
+    if abs(record.steps - result.steps) > LATE:
+        audit.faults.append(f"{where}: ended after {record.steps} steps, its recorded states end after {result.steps}")
+    first, after = differences[0], differences[1:]
+    if first > START:
+        audit.faults.append(f"{where}: its first state is {first:.2g} m from that of its seed")
+    if (worst := max(after, default=0.0)) > tolerance:
+        tick = after.index(worst)
+        audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m from what {ENGINE} gives")
 
 
 def _short(value: object) -> str:

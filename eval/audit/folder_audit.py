@@ -31,7 +31,7 @@ LEVELS = {
     SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
     CONSISTENT: "lines, plan, rules, links and derived files agree",
     REPLAYED: "episodes were played again from their actions, and ended as recorded",
-    RERUN: "the policy was asked again; no audit does that yet",
+    RERUN: "the policy was asked again at its queries, and decided as recorded",
 }
 """Level to which a result was checked, from low to high → what is known then."""
 
@@ -50,12 +50,18 @@ class Audit:
     """Numbers of the episodes whose actions are not there."""
     replayed: int | None = None
     """Episodes that were played again; None: that was not asked for."""
+    asked: int | None = None
+    """Episodes at whose queries the policy was asked again."""
+    fresh: int | None = None
+    """Episodes on seeds of the auditor."""
 
     @property
     def level(self) -> str:
         """Highest level without a contradiction."""
         if self.faults:
             return SELF_REPORTED
+        if self.asked:
+            return RERUN
         return REPLAYED if self.replayed else CONSISTENT
 
     @property
@@ -67,7 +73,8 @@ class Audit:
         """Facts of the audit by name."""
         episodes = f"{self.results['finished']} of {self.results['planned']}"
         replayed = "none" if self.replayed is None else f"{self.replayed} of {self.results['finished']}"
-        found = [("level", self.level), ("head", self.head), ("episodes", episodes), ("replayed", replayed)]
+        played = [(name, str(n)) for name, n in (("asked again", self.asked), ("fresh", self.fresh)) if n is not None]
+        found = [("level", self.level), ("head", self.head), ("episodes", episodes), ("replayed", replayed), *played]
         return [*found, ("contradictions", str(len(self.faults))), ("configuration", self.results["config_hash"])]
 
     def to_json(self) -> JsonObject:

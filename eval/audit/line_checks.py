@@ -7,8 +7,9 @@ of a line's details, of hashes and of files next to the journal.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
 
 from arena_newton import __version__, rule_sets, tasks
 from arena_newton.errors import InputError
@@ -16,9 +17,9 @@ from arena_newton.eval.folders.results import RunRecord, is_complete
 from arena_newton.eval.folders.run_folder import actions_folder, comparable
 from arena_newton.eval.records.document import CONFIG_FILE, Document, step_budgets, trackers_of
 from arena_newton.eval.records.identity import config_hash, moving_versions
-from arena_newton.eval.records.journal import CHAINED, JOURNAL_FILE, EpisodeRecord
+from arena_newton.eval.records.journal import BY_CONTENT, CHAINED, EVIDENCE, JOURNAL_FILE, EpisodeRecord
 from arena_newton.files.stored_json import JsonObject, read_regular, shown
-from arena_newton.files.untrusted_files import read_arrays
+from arena_newton.files.untrusted_files import array_digest, read_arrays
 from arena_newton.robot.g1 import TICK
 
 __all__ = ["action_faults", "configuration_faults", "is_current", "line_faults"]
@@ -170,15 +171,23 @@ def action_faults(run: RunRecord, records: Sequence[EpisodeRecord], lacking: lis
         except FileNotFoundError:
             lacking.append(record.index)
             continue
-        if hashlib.sha256(data).hexdigest() != record.actions:
-            yield f"{run.folder / path}: is not the file whose hash episode {record.index} names"
-        if (seed := _seed_of(run.folder / path, data)) != record.episode_seed:
+        try:
+            arrays = read_arrays(run.folder / path, content=data)
+        except InputError as error:
+            yield str(error)
+            continue
+        digest = array_digest(arrays) if record.schema >= BY_CONTENT else hashlib.sha256(data).hexdigest()
+        if digest != record.actions:
+            yield f"{run.folder / path}: are not the actions whose hash episode {record.index} names"
+        if (seed := _seed_of(arrays)) != record.episode_seed:
             yield f"{run.folder / path}: is of seed {seed}, episode {record.index} has {record.episode_seed}"
+        if record.schema >= BY_CONTENT and (gone := [name for name in EVIDENCE if getattr(record, name) is None]):
+            yield f"{where}: {' and '.join(gone)} are absent, which the run kept"
 
 
-def _seed_of(path: Path, content: bytes) -> int | None:
+def _seed_of(arrays: Mapping[str, np.ndarray]) -> int | None:
     """Episode seed that a file of actions names, by which a replay knows it; None where it names none."""
     try:
-        return int(read_arrays(path, ("episode_seed",), content=content)["episode_seed"])
-    except (InputError, KeyError, TypeError, ValueError):
+        return int(arrays["episode_seed"])
+    except (KeyError, TypeError, ValueError):
         return None

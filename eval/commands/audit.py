@@ -17,7 +17,7 @@ __all__ = ["AuditOptions", "run"]
 
 @dataclass(frozen=True)
 class AuditOptions:
-    """Check results folders: lines against themselves, plan, rules and hashes; links; actions; tables rebuilt.
+    """Check results folders: lines, links, actions, tables; episodes played again, their policy asked again.
 
     Four levels: self-reported (something contradicts), consistent, replayed, re-run (docs/auditing.md). Nothing in the
     folders is written. Exit code 1 where something contradicts, a line for each contradiction.
@@ -31,6 +31,17 @@ class AuditOptions:
     """Number of your own by which, with the head, they are drawn."""
     all: bool = False
     """Play all episodes again."""
+    policy: str | None = None
+    """Policy to ask again at the queries of the episodes that are played again, as --policy of run takes it."""
+    tolerance: float = 0.0
+    """Largest difference of an action that is still the policy's: 0 compares bits; 1e-4 fits a network that answered on
+    another processor."""
+    tick_tolerance: float = 0.005
+    """Largest distance of a body after a tick [m], where a run of engine warp kept its states (--record)
+    and each tick is checked on engine mujoco."""
+    fresh: int = 0
+    """Play so many new episodes of --policy for each task, tracker and mode, on a group seed drawn by --draw; an exact
+    test compares their rate with the claimed one."""
     out: str | None = None
     """Folder for audit.json and audit.md; without it they are printed alone."""
 
@@ -51,6 +62,14 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
     named = [inside for folder in folders for inside in runs_in(folder)]
     if options.replay < 0:
         raise InputError(f"--replay {options.replay}: expected a number of episodes")
+    if options.fresh < 0:
+        raise InputError(f"--fresh {options.fresh}: expected a number of episodes")
+    if not options.tolerance >= 0:
+        raise InputError(f"--tolerance {options.tolerance:g}: expected at least 0")
+    if options.policy is not None and not (options.replay or options.all or options.fresh):
+        raise InputError("--policy: asks at the queries of --replay or --all, or plays --fresh episodes; add one")
+    if options.policy is None and (options.fresh or options.tolerance):
+        raise InputError("--fresh and --tolerance: are of a --policy; name it")
     if options.head is not None and len(named) > 1:
         raise InputError("--head: is of one folder")
     audits = []
@@ -59,7 +78,13 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         if options.replay or options.all:
             from arena_newton.eval.audit.action_replay import drawn, replay
 
-            replay(one, drawn(one, None if options.all else options.replay, options.draw), factories)
+            asked = {name: getattr(options, name) for name in ("policy", "tolerance", "tick_tolerance")}
+            chosen = drawn(one, None if options.all else options.replay, options.draw)
+            replay(one, chosen, factories, **asked)
+        if options.fresh and options.policy is not None:
+            from arena_newton.eval.audit.fresh_episodes import play_fresh
+
+            play_fresh(one, options.policy, options.fresh, options.draw, factories)
         audits.append(one)
         print(f"{folder}: {', '.join(f'{name} {value}' for name, value in one.facts())}")
         for fault in one.faults:

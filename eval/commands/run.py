@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,8 @@ __all__ = ["run"]
 def run(options: RunOptions, factories: Factories | None = None) -> int:
     """Run, by default twice: experts, then in a folder inside a few episodes of the policy that comes with the package.
 
-    What is wrong with flags or folders is found before the libraries of physics load, which takes seconds.
+    Two processes play the default run on a CPU that has as many cores. What is wrong with flags or folders is found
+    before the libraries of physics load, which takes seconds.
     """
     from arena_newton.cli.command_line import INTERRUPTED
     from arena_newton.doctor import versions
@@ -25,6 +27,9 @@ def run(options: RunOptions, factories: Factories | None = None) -> int:
     from arena_newton.eval.plan.config import resolve
 
     config = resolve(options)
+    if is_quick(options) and config.device == "cpu" and not (options.dealt or options.viewer or factories):
+        flags = dataclasses.replace(config.flags, jobs=min(2, len(os.sched_getaffinity(0))))
+        config = dataclasses.replace(config, flags=flags)
     folders = [ResultsFolder(results_folder(options.out, config.shard), config, versions())]
     if is_quick(options) and options.policy == "expert" and not options.record:
         more = _learned(config.flags, folders[0].path / "learned")
@@ -32,14 +37,17 @@ def run(options: RunOptions, factories: Factories | None = None) -> int:
     for folder in folders:
         folder.check()
     if config.flags.dealt:
-        from arena_newton.eval.workers.dealing import execute
+        from arena_newton.eval.workers import dealing
+
+        code = dealing.execute(folders, factories)
     else:
         from arena_newton.eval.play.run import execute
-    code = 0
-    for folder in folders:
-        code = max(code, execute(folder, factories))
-        if code == INTERRUPTED:
-            return code
+
+        code = 0
+        for folder in folders:
+            code = max(code, execute(folder, factories) if code != INTERRUPTED else code)
+    if code == INTERRUPTED:
+        return code
     if len(folders) > 1:
         experts, sees = (folder.path / "report.html" for folder in folders)
         print(f"\nreport of the experts: {experts}, of the policy that sees: {sees}")

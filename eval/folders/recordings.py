@@ -1,100 +1,123 @@
-"""Recordings of what a policy decided: one file of canonical actions per episode."""
+"""Evidence of what a policy decided and was shown: a file of canonical actions per episode, and hashes."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from pathlib import Path
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.journal import StorageError
-from arena_newton.files.own_files import replace_atomically
+from arena_newton.files.untrusted_files import array_digest
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 
-__all__ = ["OUTCOMES_FILE", "ActionRecorder", "write_actions"]
+__all__ = ["OUTCOMES_FILE", "ActionRecorder", "packed_actions"]
 
 OUTCOMES_FILE = "outcomes.jsonl"
 """File of the episodes that LeRobot's command line played: a line with outcome, reason, steps and margin of each."""
 
 
-def write_actions(path: Path, actions: Sequence[np.ndarray], *, episode_seed: int, gym_id: str, mode: str) -> str:
-    """Write the actions that an episode executed, as `--policy replay:` reads them.
+def packed_actions(
+    actions: Sequence[np.ndarray], *, episode_seed: int, gym_id: str, mode: str, queries: Sequence[int] = ()
+) -> tuple[bytes, str]:
+    """File of the actions that an episode executed, `<task>_<mode>_s<group seed>_r<repeat>.npz`, for a replay.
 
     Args:
-        path: The file, `<task>_<mode>_s<group seed>_r<repeat>.npz`.
         actions: Canonical actions, one per tick, each of shape [40].
         episode_seed: The episode's seed.
         gym_id: The task's Gym id.
         mode: One of `rule_types.MODES`.
+        queries: Ticks at which the policy was asked, where they are known.
 
     Returns:
-        SHA-256 of the file.
-
-    Raises:
-        StorageError: The file cannot be written.
+        The file, and the hash of its arrays.
     """
-    try:
-        # A process that was given up for dead may still play the episode.
-        with replace_atomically(path, shared=True) as file:
-            np.savez_compressed(
-                file,
-                action=np.stack(actions),
-                episode_seed=np.int64(episode_seed),
-                task=np.str_(gym_id),
-                mode=np.str_(mode),
-            )
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror})") from error
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    arrays: dict[str, np.ndarray] = {
+        "action": np.stack(actions),
+        "episode_seed": np.asarray(np.int64(episode_seed)),
+        "task": np.asarray(np.str_(gym_id)),
+        "mode": np.asarray(np.str_(mode)),
+        "queries": np.asarray(queries, np.int32),
+    }
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # its flags are named alike
+    return file.getvalue(), array_digest(arrays)
+
+
+@dataclass
+class _Running:
+    """Evidence of the episode that a world runs."""
+
+    actions: list[np.ndarray] = field(default_factory=list)
+    queries: list[int] = field(default_factory=list)
+    shown: hashlib._Hash = field(default_factory=hashlib.sha256)
 
 
 class ActionRecorder(Recorder):
-    """Keeps a policy's actions until their episode ends, then writes them."""
+    """Keeps a policy's actions, and hashes of what it was shown and of the last state, until their episode ends."""
 
-    def __init__(self, folder: Path, inside: str = "actions"):
-        """Write into a folder inside a results folder: `<task>_<mode>_s<group seed>_r<repeat>.npz`.
+    def __init__(self, keep: Callable[[str, bytes], None], inside: str = "actions"):
+        """Record without an episode yet.
 
-        The files hold the arrays `action` [ticks, 40] and `episode_seed`, and the texts `task`, the task's Gym id, and
-        `mode`.
+        Args:
+            keep: Takes path below the results folder, and content, of the file of an episode's actions.
+            inside: Folder of the files: `<task>_<mode>_s<group seed>_r<repeat>.npz`, with the arrays `action`
+                [ticks, 40], `episode_seed` and `queries`, and the texts `task`, the task's Gym id, and `mode`.
         """
-        self.folder, self.inside = folder, inside
-        self._actions: dict[int, list[np.ndarray]] = {}
-        self._written: dict[int, tuple[str, str]] = {}
-        """Path below the results folder, and SHA-256, by the episode's number."""
+        self._keep_file, self.inside = keep, inside
+        self._running: dict[int, _Running] = {}
+        self._ended: dict[int, tuple[dict[str, str], dict[str, str]]] = {}
+        """File and hashes by the episode's number."""
 
     def start(self, env: World, world: int, episode: Episode) -> None:
         """An episode without actions yet."""
-        self._actions[world] = []
+        self._running[world] = _Running()
+
+    def query(self, env: World, observation: Observation) -> None:
+        """Add what the worlds that ask are shown."""
+        asking = np.flatnonzero(observation.mask).tolist()
+        parts = {"state": observation.state} | {f"picture {name}": one for name, one in observation.images.items()}
+        parts |= {f"depth {name}": one for name, one in observation.depths.items()}
+        rows = [(name, parts[name][asking].detach().cpu().numpy()) for name in sorted(parts)]
+        for row, world in enumerate(asking):
+            tick, mine = int(env.tick[world]), self._running[world]
+            mine.queries.append(tick)
+            for name, values in rows:
+                mine.shown.update(f"{tick} {name} {values.dtype.str} {values.shape[1:]}\n".encode())
+                mine.shown.update(values[row].tobytes())
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """Keep the actions of the worlds that act."""
         rows = action.detach().cpu().numpy()
         for world in np.flatnonzero(env.active & (env.tick >= 0)).tolist():
-            self._actions[world].append(rows[world].copy())
+            self._running[world].actions.append(rows[world].copy())
 
     def finish(self, env: World, world: int, result: EpisodeResult) -> None:
-        """Write the actions that were executed, if any were.
+        """Hand over the actions that were executed, if any were.
 
         Raises:
             StorageError: The file cannot be written.
         """
-        actions = self._actions.pop(world)
+        mine = self._running.pop(world)
         if result.steps < 1:
             return
         episode, gym_id = result.episode, env.spec.gym_id
         name = f"{self.inside}/{episode.key.replace('/', '_')}.npz"
-        seed, mode = episode.episode_seed, episode.mode
-        digest = write_actions(self.folder / name, actions, episode_seed=seed, gym_id=gym_id, mode=mode)
-        self._written[episode.index] = name, digest
+        file, digest = packed_actions(
+            mine.actions, episode_seed=episode.episode_seed, gym_id=gym_id, mode=episode.mode, queries=mine.queries
+        )
+        self._keep_file(name, file)
+        state = {key: getattr(env.physics, key).numpy()[world] for key in ("qpos", "qvel")}
+        hashes = {"actions": digest, "final_state": array_digest(state), "shown": mine.shown.hexdigest()}
+        self._ended[episode.index] = {"actions": name}, hashes
 
-    def taken(self, index: int) -> tuple[dict[str, str], str | None]:
-        """Path of an episode's actions below the results folder, by `actions`, and its SHA-256; once.
+    def taken(self, index: int) -> tuple[dict[str, str], dict[str, str]]:
+        """Path of an episode's actions below the results folder, by `actions`, and `journal.EVIDENCE` by key; once.
 
         Args:
             index: The episode's number. Of one without actions there is neither.
         """
-        path, digest = self._written.pop(index, (None, None))
-        return ({} if path is None else {"actions": path}), digest
+        return self._ended.pop(index, ({}, {}))

@@ -25,6 +25,7 @@ from arena_newton.eval.records.sharding import Shard
 from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.files.stored_json import JsonObject, check_types
 from arena_newton.files.text import counted, plain_text
+from arena_newton.pictures.settings import CameraConfig
 
 __all__ = [
     "BREAK_FILE",
@@ -32,12 +33,14 @@ __all__ = [
     "RECORDING_FLAGS",
     "SUBFOLDERS",
     "ResultsFolder",
+    "CAMERAS",
     "PROCESSOR",
     "actions_folder",
     "comparable",
     "iso",
     "results_folder",
     "setting",
+    "shown_by",
     "stored_options",
     "timestamp",
 ]
@@ -325,6 +328,14 @@ class ResultsFolder:
         with contextlib.suppress(ArenaError, ValueError):
             write_atomic(self.path / BREAK_FILE, traceback.format_exc())
 
+    def keep_file(self, name: str, content: bytes) -> None:
+        """Write a file of an episode, by its path below the folder.
+
+        Raises:
+            StorageError: It cannot be written.
+        """
+        write_atomic(self.path / name, content)
+
     def remove_unfinished(self) -> None:
         """Remove what unfinished recordings left."""
         for pattern in (*(f"{name}/*{PARTIAL}" for name in SUBFOLDERS), "actions/*.partial", f"actions/*/*{PARTIAL}"):
@@ -346,9 +357,16 @@ def _versions(document: Document) -> list[dict[str, str | None]]:
 PROCESSOR = "processor"
 """Fact of an environment: the vector instructions that torch computes with on this machine, such as AVX512. Networks'
 last bits depend on it. It is no part of any hash: nodes of a cluster differ, and may play one plan."""
+CAMERAS = "cameras"
+"""Fact of an environment: the policy's cameras by name. It is no part of any hash, as the policy is."""
+
+
+def shown_by(cameras: Mapping[str, CameraConfig]) -> JsonObject:
+    """Fact of an environment with these cameras; nothing for a policy that does not see."""
+    return {CAMERAS: {name: dataclasses.asdict(one) for name, one in cameras.items()}} if cameras else {}
 
 
 def comparable(facts: JsonObject) -> JsonObject:
-    """Facts of an environment without its processor and the number of its device: `cuda:0` and `cuda:1` are alike."""
-    kept = {key: value for key, value in facts.items() if key != PROCESSOR}
+    """Facts of an environment without processor, cameras and number of its device: `cuda:0` and `cuda:1` are alike."""
+    kept = {key: value for key, value in facts.items() if key not in (PROCESSOR, CAMERAS)}
     return kept | ({"device": str(kept["device"]).split(":")[0]} if "device" in kept else {})

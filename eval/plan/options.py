@@ -178,7 +178,8 @@ class Jobs:
     """Processes of this machine."""
 
     jobs: int = 1
-    """Processes of this machine that play at once, each on cores of its own; they take its GPUs in turn."""
+    """Processes of this machine that play at once, each on cores of its own; they take its GPUs in turn. The default
+    run takes two where there are two cores and no GPU."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import torch
@@ -25,7 +26,7 @@ from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.recordings import ActionRecorder
-from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, actions_folder, iso
+from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, actions_folder, iso, shown_by
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
@@ -295,7 +296,7 @@ class RunPlayer:
             self.progress.say("  compiling kernels, once; this takes a minute or some")
         try:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
-            own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()}
+            own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()} | shown_by(config.cameras)
             for names in groups(order):
                 facts = self.folder.register(" ".join(names), own)
             if flags.verbose:
@@ -303,7 +304,7 @@ class RunPlayer:
             recorder = _recorder(config, self.folder.path, tracker)
             recorders: list[Recorder] = [] if recorder is None else [recorder]
             inside = actions_folder(flags.tracker, tracker)
-            actions = ActionRecorder(self.folder.path, inside) if flags.actions else None
+            actions = ActionRecorder(self.folder.keep_file, inside) if flags.actions else None
             recorders += [] if actions is None else [actions]
             if flags.viewer_failures:
                 recorders.append(FailureRecorder(self.folder.path / "failures", _prefix(flags, tracker)))
@@ -322,8 +323,8 @@ class RunPlayer:
             def keep(result: EpisodeResult, media: dict[str, str]) -> None:
                 pictures = recorder.media(result.episode) if recorder is not None else {}
                 found = None if signals is None else signals.taken(result.episode.index)
-                files, digest = ({}, None) if actions is None else actions.taken(result.episode.index)
-                self._keep(result, pictures | files | media, found, digest)
+                files, evidence = ({}, {}) if actions is None else actions.taken(result.episode.index)
+                self._keep(result, pictures | files | media, found, evidence)
                 left.pop(result.episode.index, None)
 
             def on_finish(result: EpisodeResult) -> None:
@@ -388,7 +389,7 @@ class RunPlayer:
         result: EpisodeResult,
         media: dict[str, str],
         signals: EpisodeSignals | None = None,
-        actions: str | None = None,
+        evidence: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Append an episode to the journal.
 
@@ -397,7 +398,7 @@ class RunPlayer:
         """
         where, records = self.folder.path, self.journal.records
         check_again(self.config, where, records, result, result.episode, media.values())
-        record = _record(result, media, self.hashes, signals, actions, privileged=self.config.privileged)
+        record = _record(result, media, self.hashes, signals, evidence, privileged=self.config.privileged)
         self.journal.append(record)
         self.ended[record.index] = record
 
@@ -437,7 +438,7 @@ def _record(
     media: dict[str, str],
     hashes: dict[str, str | None],
     signals: EpisodeSignals | None = None,
-    actions: str | None = None,
+    evidence: Mapping[str, str] = MappingProxyType({}),
     *,
     privileged: bool = False,
 ) -> EpisodeRecord:
@@ -467,5 +468,7 @@ def _record(
         progress=float(result.progress),
         events=tuple(result.events),
         signals=signals,
-        actions=actions,
+        actions=evidence.get("actions"),
+        final_state=evidence.get("final_state"),
+        shown=evidence.get("shown"),
     )

@@ -25,7 +25,9 @@ from arena_newton.files.text import counted
 from arena_newton.interfaces import EpisodeEvent
 
 __all__ = [
+    "BY_CONTENT",
     "CHAINED",
+    "EVIDENCE",
     "JOURNAL_FILE",
     "SCHEMA",
     "ContradictionError",
@@ -41,12 +43,16 @@ __all__ = [
 ]
 
 JOURNAL_FILE = "episodes.jsonl"
-SCHEMA = 3
+SCHEMA = 4
 """Newest form of a journal line. 1: without phases, predicates, progress and events, and without this key; 2: without
-`previous` and `actions`."""
+`previous` and `actions`; 3: `actions` is the hash of the file, without `final_state` and `shown`."""
 CHAINED = 3
 """First form whose lines are linked."""
+BY_CONTENT = 4
+"""First form whose `actions` are hashed by content: another zlib packs the same numbers into another file."""
 
+EVIDENCE = ("actions", "final_state", "shown")
+"""Keys of hashes by which an episode can be checked."""
 OUTCOMES = ("success", "fall", "timeout", "error")
 PlanNumber = Annotated[Count, Fit("a number of the plan")]
 Ticks = Annotated[Count, Fit("a number of ticks")]
@@ -120,7 +126,12 @@ class EpisodeRecord:
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
     """Signals that tell why it failed; None, and absent in the line, without `eval run --failures`."""
     actions: FileHash = None
-    """SHA-256 of the file of its actions, `media.actions`; None, and absent in the line, where none is kept."""
+    """SHA-256 of the arrays in the file of its actions, `media.actions` (`untrusted_files.array_digest`); None, and
+    absent in the line, as the next two, where no actions are kept."""
+    final_state: FileHash = None
+    """SHA-256 of positions and velocities of its world as it ended."""
+    shown: FileHash = None
+    """SHA-256 of state and pictures that the policy was shown at its queries, in their order."""
     previous: FileHash = None
     """SHA-256 of the line before in the journal, with its line end; of nothing in the first line. Absent in a line of
     schema 1 or 2."""
@@ -137,7 +148,7 @@ class EpisodeRecord:
         if self.signals is not None:
             values["signals"] = dataclasses.asdict(self.signals)
         absent = {"privileged": not self.privileged}
-        absent |= {name: values[name] is None for name in ("signals", "actions", "previous")}
+        absent |= {name: values[name] is None for name in ("signals", *EVIDENCE, "previous")}
         return {key: value for key, value in values.items() if not absent.get(key)}
 
     @classmethod
@@ -313,8 +324,8 @@ class EpisodeLines(Protocol):
         """Take the record of an episode that ended."""
 
 
-def write_atomic(path: Path, text: str, kept: str = "the journal is kept") -> None:
-    """Write a text file so that a reader sees the old content or the new, never a part; links are not followed.
+def write_atomic(path: Path, content: str | bytes, kept: str = "the journal is kept") -> None:
+    """Write a file so that a reader sees the old content or the new, never a part; links are not followed.
 
     The message of an error ends with what is `kept`.
 
@@ -323,6 +334,6 @@ def write_atomic(path: Path, text: str, kept: str = "the journal is kept") -> No
     """
     try:
         with replace_atomically(path, sync=True) as file:
-            file.write(text.encode("utf-8"))
+            file.write(content.encode() if isinstance(content, str) else content)
     except OSError as error:
         raise _explain(error, path, kept) from None

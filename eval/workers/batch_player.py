@@ -24,7 +24,7 @@ from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_p
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.eval.reports.progress import kernels_to_compile
-from arena_newton.eval.workers.messages import Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
+from arena_newton.eval.workers.messages import ActionFile, Broke, Built, Ended, EpisodeBatch, Event, Ticks, broke
 from arena_newton.files.new_folder import held
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.policies.base import Policy
@@ -79,7 +79,7 @@ def play(
     # Episodes of a broken environment are played again by the driver, which also says when it is enough.
     flags = dataclasses.replace(config.flags, skip_broken=False)
     config = dataclasses.replace(config, flags=flags, episodes=tuple(episodes))
-    if flags.video or flags.strip or flags.record or flags.actions or flags.viewer_failures:
+    if flags.video or flags.strip or flags.record or flags.viewer_failures:
         _check_shared(path)
     folder = _BatchFolder(path, config, part.config_hash, send)
     with contextlib.ExitStack() as compiling:
@@ -103,8 +103,8 @@ def _check_shared(path: Path) -> None:
     while not (path / JOURNAL_FILE).is_file():
         if time.monotonic() > until:
             raise InputError(
-                f"{os.uname().nodename}: {path} is not there; episodes write files into the results folder, which must "
-                "be on a disk that all nodes share; without one write no files (--no-actions)"
+                f"{os.uname().nodename}: {path} is not there; films, strips, recordings and scenes of failures are "
+                "written into the results folder, which must be on a disk that all nodes share"
             )
         time.sleep(0.2)
 
@@ -139,6 +139,10 @@ class _BatchFolder(ResultsFolder):
         plain = plain_facts(facts)
         self._send(Built(plain))
         return plain
+
+    def keep_file(self, name: str, content: bytes) -> None:
+        """Send a file of an episode."""
+        self._send(ActionFile(name, content))
 
     def keep_trace(self) -> None:
         """Keep the error, to be sent."""

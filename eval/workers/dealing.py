@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -34,8 +34,7 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecord, write_atomic
 from arena_newton.eval.reports.progress import Progress
-from arena_newton.eval.workers.backend import PoolBackend
-from arena_newton.eval.workers.messages import Built, Done, Ended, Event, Opened, Ticks
+from arena_newton.eval.workers.messages import ActionFile, Built, Done, Ended, Event, Opened, Ticks
 from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
 from arena_newton.files.text import plain_text
 from arena_newton.robot.g1 import TICK
@@ -55,12 +54,12 @@ GIVEN_UP = 5
 """Number of episodes of a task, tracker and mode that stop the run if they end as errors before one ends otherwise."""
 
 
-def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
-    """Run or continue the run of a folder that was checked by other processes.
+def execute(folders: Sequence[ResultsFolder], factories: Factories | None = None) -> int:
+    """Run or continue runs whose folders were checked, one after the other, by other processes.
 
     Args:
-        folder: Of the run; its flags say which processes.
-        factories: What the processes build the run with, importable there; the real parts by default.
+        folders: Of the runs; the flags of the first say which processes.
+        factories: What the processes build the runs with, importable there; the real parts by default.
 
     Returns:
         Exit code: 0 when every planned episode has an outcome other than error, 1 otherwise, 130 when interrupted.
@@ -70,22 +69,23 @@ def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
         StorageError: The results folder cannot be written; finished episodes are kept.
         RunStopped: Simulator, tracker, policy or cluster broke down as a whole; finished episodes are kept.
     """
-    with backend_of(folder.config.flags, folder.config.device) as backend:
-        began = time.perf_counter()
-        if not _played(backend, folder, factories):
-            return INTERRUPTED
-        return reported(folder, time.perf_counter() - began)
-
-
-def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | None) -> bool:
-    """Play what is missing in a folder; False when it was interrupted."""
-    pool, job = WorkerPool(backend, len(folder.config.episodes), factories), Job(folder)
-    resume = f"{command(folder, 'resume')} {backend.flag}"
-    with contextlib.ExitStack() as ended:
+    first, code = folders[0].config, 0
+    with backend_of(first.flags, first.device) as backend, contextlib.ExitStack() as ended:
+        pool = WorkerPool(backend, max(len(folder.config.episodes) for folder in folders), factories)
         ended.callback(pool.dismiss)
-        config = pool.opened(job)
-        journal = ended.enter_context(folder.opened(config))
-        ended.callback(pool.dismiss)  # who writes files has ended before those that are not whole are removed
+        for folder in folders:
+            began = time.perf_counter()
+            if not _played(pool, folder):
+                return INTERRUPTED
+            code = max(code, reported(folder, time.perf_counter() - began))
+    return code
+
+
+def _played(pool: WorkerPool, folder: ResultsFolder) -> bool:
+    """Play what is missing in a folder; False when it was interrupted."""
+    job, resume = Job(folder), f"{command(folder, 'resume')} {pool.backend.flag}"
+    config = pool.opened(job)
+    with folder.opened(config) as journal:
         try:
             with naming_the_command(resume, lambda: kept(config, journal.records)):
                 done, waiting = begun(config, folder, journal.records)
@@ -94,6 +94,9 @@ def _played(backend: PoolBackend, folder: ResultsFolder, factories: Factories | 
         except KeyboardInterrupt:
             print(f"\ninterrupted: {kept(config, journal.records)}; continue with: {resume}")
             return False
+        finally:
+            if any(worker.assignment is not None for worker in pool.workers):
+                pool.dismiss()  # who writes files has ended before those that are not whole are removed
     return True
 
 
@@ -217,6 +220,8 @@ class DealtRun:
             assignment.built = True
         elif isinstance(message, Ticks):
             self.shown.tick(message.count)
+        elif isinstance(message, ActionFile):
+            self.folder.keep_file(message.name, message.content)
         elif isinstance(message, Ended):
             self._keep(assignment, EpisodeRecord.from_json(f"a process of {self.pool.backend.flag}", message.line))
         elif isinstance(message, Lost):

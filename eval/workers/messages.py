@@ -12,7 +12,8 @@ from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import plain_text
 from arena_newton.policies.base import PolicyUnavailable
 
-__all__ = ["Broke", "Built", "Done", "Ended", "Event", "Node", "Opened", "EpisodeBatch", "Ticks", "broke"]
+__all__ = ["Broke", "Built", "Done", "Ended", "EpisodeBatch", "ActionFile", "Event", "Node", "Opened", "Ticks"]
+__all__ += ["broke"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,15 @@ class Ticks:
 
 
 @dataclass(frozen=True)
+class ActionFile:
+    """File of the actions of an episode whose line follows, for the results folder."""
+
+    name: str
+    """Path below the folder."""
+    content: bytes
+
+
+@dataclass(frozen=True)
 class Ended:
     """An episode ended, and its files are on the disk."""
 
@@ -92,7 +102,7 @@ class Broke:
     trace: str
 
 
-Event = Built | Ticks | Ended | Broke
+Event = Built | Ticks | ActionFile | Ended | Broke
 
 
 def broke(error: BaseException) -> Broke:

@@ -21,7 +21,14 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.chain import outcome_of
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
-from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, StorageError, chained_line, write_atomic
+from arena_newton.eval.records.journal import (
+    EVIDENCE,
+    JOURNAL_FILE,
+    EpisodeRecord,
+    StorageError,
+    chained_line,
+    write_atomic,
+)
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
 from arena_newton.eval.reports import report
 from arena_newton.files.own_files import PARTIAL, file_label, replace_atomically
@@ -226,7 +233,7 @@ def _whole(runs: Sequence[RunRecord], kept: Sequence[_Kept]) -> bool:
 
 
 def _check_same(known: _Kept, record: EpisodeRecord, folder: Path) -> None:
-    difference = differing_key(outcome_of(known.record), outcome_of(record), ignored=("actions",))
+    difference = differing_key(outcome_of(known.record), outcome_of(record), ignored=EVIDENCE)
     if difference is None:
         return
     key, was, now = difference

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,6 +24,8 @@ CUDA_ROWS = 64
 depend on how many others ask. 64 holds the 60 episodes of a cell."""
 CPU_ROWS = 1
 """Rows of a forward pass on the CPU: libraries sum in another order where the number of rows differs."""
+HELPED = 4
+"""Most cores of a query on the CPU; each number of them that is used holds the weights once more."""
 
 
 class LearnedPolicy(Policy):
@@ -91,21 +92,20 @@ class LearnedPolicy(Policy):
         size = CPU_ROWS if device.type == "cpu" else CUDA_ROWS
 
         @torch.inference_mode()
-        def query(some: list[int]) -> torch.Tensor:
+        def query(some: list[int], threads: int) -> torch.Tensor:
             """Chunks of some worlds, filled up to the size of a forward pass."""
             filled = [*some, *([some[0]] * (size - len(some)))]
             seen = pictures[filled].to(device).permute(0, 3, 1, 2).float() / 255.0
             given = state[filled].to(device, torch.float32)
             tasks = None if vector is None else self._normalised(TASK_VECTOR, vector.expand(size, -1))
-            chunk = network(self._normalised(FRONT, seen), self._normalised(STATE, given), tasks)
+            chunk = network.answer(self._normalised(FRONT, seen), self._normalised(STATE, given), tasks, threads)
             spread = self._spreads.get("action")
             chunk = chunk if spread is None else spread.restored(chunk)
             return chunk[: len(some), : self.chunk_size]
 
         parts = [serving[first : first + size] for first in range(0, len(serving), size)]
-        with _querying(device, len(parts)) as each:
-            for some, chunk in zip(parts, each(query, parts), strict=True):
-                actions[some] = chunk.to(state.device)
+        for some, chunk in zip(parts, _answers(device, query, parts), strict=True):
+            actions[some] = chunk.to(state.device)
         usable = torch.isfinite(actions[serving]).all(dim=2).all(dim=1).tolist()
         errors |= {w: "the network's answer is not finite" for w, ok in zip(serving, usable, strict=True) if not ok}
         return Chunk(actions, errors)
@@ -169,27 +169,25 @@ class LearnedPolicy(Policy):
         return torch.tensor(numbers, device=device) if numbers else None
 
 
-Queries = Callable[[Callable[[list[int]], torch.Tensor], list[list[int]]], Iterable[torch.Tensor]]
+def _answers(
+    device: torch.device, query: Callable[[list[int], int], torch.Tensor], parts: list[list[int]]
+) -> Iterator[torch.Tensor]:
+    """Answers to queries: on the CPU each on one core, as many at once as torch may have threads.
 
-
-@contextlib.contextmanager
-def _querying(device: torch.device, count: int) -> Iterator[Queries]:
-    """Runs queries: on the CPU each on one core, as many at once as torch may have threads.
-
-    A query is too small for two cores: where the machine is busy they lose more by waiting for each other. And an
-    answer then has the same bits on machines with another number of cores.
+    Cores that the last queries leave idle help them, up to `HELPED` a query. Where the machine is busy cores lose more
+    by waiting for each other than they win, so no more queries are divided than must be.
     """
     threads = torch.get_num_threads()
     if device.type != "cpu" or threads == 1:
-        yield map
+        yield from (query(some, 1) for some in parts)
         return
+    last = len(parts) % threads
+    whole, divided = parts[: len(parts) - last], parts[len(parts) - last :]
     torch.set_num_threads(1)
     try:
-        if count > 1:
-            with ThreadPoolExecutor(min(threads, count), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-                yield pool.map
-        else:
-            yield map
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            yield from pool.map(lambda some: query(some, 1), whole)
+            yield from pool.map(lambda some: query(some, min(threads - last + 1, HELPED)), divided)
     finally:
         torch.set_num_threads(threads)  # of this thread, and of those that begin later
 

@@ -1,6 +1,11 @@
 """The documentation's examples run, and the names in it exist."""
 
+import html
 import re
+import runpy
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +41,30 @@ def test_links_lead_somewhere(page):
             other = (page.parent / file).resolve() if file else page
             assert other.exists(), target
             assert not heading or heading in anchors(other), target
+
+
+@pytest.mark.release
+def test_the_site(tmp_path):
+    """The site builds without a warning, and has every page, the glossary's rows, the examples and the public names."""
+    pytest.importorskip("sphinx", reason="needs the extra [docs]: sphinx is not installed")
+    command = [sys.executable, str(ROOT / "docs" / "build.py"), "--out", str(tmp_path)]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    listed = (tmp_path / "llms.txt").read_text()
+    pages = [page.relative_to(ROOT).with_suffix(".html") for page in DOCS]
+    assert all(f"({page})" in listed and (tmp_path / page).is_file() for page in pages)
+
+    def text(page: str) -> str:
+        return html.unescape(re.sub(r"<[^>]+>", "", (tmp_path / page).read_text()))
+
+    rows = (ROOT / "CONTRIBUTING.md").read_text().split("## Glossary")[1].split("\n\n")[2].splitlines()[2:]
+    cells = [re.sub(r"[`*]", "", cell.strip()) for row in rows for cell in row.strip("|").split("|")]
+    assert len(rows) > 30 and [cell for cell in cells if cell not in text("docs/glossary.html")] == []
+    examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
+    assert all(f"python examples/{name}.py" in text(f"examples/{name}.html") for name in examples)
+    assert {path.stem for path in (tmp_path / "examples").glob("*.html")} == examples | {"index"}
+    public = (tmp_path / "api" / "arena_newton.html").read_text()
+    assert all(f'id="arena_newton.{name}"' in public for name in ("ArenaEnv", "ArenaEnv.step", "Rollout.run"))
 
 
 def test_commands_of_the_index_exist():
@@ -75,3 +104,29 @@ def test_the_world_from_python():
     step, ball = world["plan"].grad[:, :2], world["where"].grad[:, world["judge"].ball]
     assert step.isfinite().all() and step.abs().max() > 0.0
     assert ball.isfinite().all() and ball.norm(dim=1).min() > 0.5
+
+
+TUTORIALS = (ROOT / "docs" / "tutorials.md").read_text().split("\n## ")[1:]
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("part", TUTORIALS, ids=lambda part: part.splitlines()[0])
+def test_a_tutorial_runs_as_it_stands(part, tmp_path, monkeypatch, capsys):
+    """Commands and programs of a tutorial run one after the other in an empty folder, and say what it says."""
+    monkeypatch.chdir(tmp_path)
+    for kind, block in re.findall(r"^```(\w+)\n(.*?)^```$", part, flags=re.DOTALL | re.MULTILINE):
+        if kind == "usda":
+            Path(re.search(r"Save this as `([\w.]+)`", part)[1]).write_text(block)
+        elif kind == "python":
+            exec(compile(block, "docs/tutorials.md", "exec"), {"__name__": "tutorial"})
+        else:
+            for line in block.splitlines():
+                python, minus, module, *flags = shlex.split(line)
+                assert (python, minus) == ("python", "-m")
+                monkeypatch.setattr(sys, "argv", [module, *flags])
+                with pytest.raises(SystemExit) as ended:
+                    runpy.run_module(module, run_name="__main__")
+                assert not ended.value.code, line
+    said = capsys.readouterr().out
+    for words in re.findall(r"`(timeout|reward/s|early end every)`", part):
+        assert words in said

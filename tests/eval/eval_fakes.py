@@ -33,7 +33,9 @@ class FakeEnv:
     """
 
     startup_ticks = 0
-    physics = scene = None
+    scene = None
+    cameras = {}
+    physics = SimpleNamespace(qpos=torch.zeros(1, 7).expand(4096, 7), qvel=torch.zeros(1, 6).expand(4096, 6))
     torch_device = torch.device("cpu")
 
     def __init__(self, task, *, worlds=1, mode="base", rules="paper", tracker=None, **options):

@@ -28,7 +28,8 @@ class QuickEnv(CachedEnv):
     def verdict(self, world):
         found = super().verdict(world)
         won = self.tick[world] >= self.ends[world]
-        return dataclasses.replace(found, margin=0.0, predicates={}) if won else found
+        held = dict.fromkeys(found.predicates, int(self.tick[world]))
+        return dataclasses.replace(found, margin=0.0, predicates=held) if won else found
 
 
 def main(arguments):

@@ -13,6 +13,7 @@ divided among threads, each with a product of its own. On other devices the batc
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import itertools
@@ -28,6 +29,7 @@ import onnxruntime
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.trackers.inference.stored_graphs import graph_file, read_graph, write_graph
 
 __all__ = ["BlockRunner", "compiled"]
 
@@ -43,10 +45,11 @@ _PROBE_SEED = 20240
 Network = Callable[[torch.Tensor], torch.Tensor]
 
 
-def session_options() -> onnxruntime.SessionOptions:
-    """Options of a session on one thread that does not write to the screen."""
+def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
+    """Options of a session on some threads that does not write to the screen; a thread that waits takes no core."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 4
     return options
 
@@ -54,9 +57,21 @@ def session_options() -> onnxruntime.SessionOptions:
 class OnnxProduct:
     """A network in ONNX Runtime: rows in, rows out."""
 
-    def __init__(self, session: onnxruntime.InferenceSession):
-        """Make one of a session with one input, `obs`, and one output, `action`."""
-        self._session = session
+    def __init__(self, graph: bytes, threads: int = 1):
+        """Make one of a file with one input, `obs`, and one output, `action`, on some threads."""
+        self._session = onnxruntime.InferenceSession(
+            graph, session_options(threads), providers=["CPUExecutionProvider"]
+        )
+        self._graph, self._threads = graph, threads
+        self._others: dict[int, OnnxProduct] = {}
+
+    def on(self, threads: int) -> OnnxProduct:
+        """The network on a number of threads, which changes no bit; each number holds the weights once more."""
+        if threads == self._threads:
+            return self
+        if threads not in self._others:
+            self._others[threads] = OnnxProduct(self._graph, threads)
+        return self._others[threads]
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
         """Outputs of any number of rows; a new tensor."""
@@ -78,7 +93,7 @@ class OnnxProduct:
 
 
 def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-4, atol: float = 1e-5) -> OnnxProduct:
-    """The network in ONNX Runtime, on one thread of the CPU.
+    """The network in ONNX Runtime, on one thread of the CPU; its graph is stored in the kernel cache.
 
     Args:
         network: Maps a tensor to a tensor, rows first.
@@ -90,26 +105,39 @@ def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-
         InputError: It cannot be exported, or ONNX Runtime computes something else.
     """
     probe = torch.randn(shape, generator=torch.Generator().manual_seed(8))
-    file: Any = io.BytesIO()  # the exporter takes buffers, its types do not say so
-    try:
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            # The exporter is deprecated. Its successor (dynamo=True) gives the same bits, but takes 8 s instead of
-            # 0.3 s the first time in a process, 1.3 s instead of 0.05 s later, and fails to optimise `Symmetric`.
-            torch.onnx.export(
-                network.eval(), (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
-                dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
-            )  # fmt: skip
-            session = onnxruntime.InferenceSession(
-                file.getvalue(), session_options(), providers=["CPUExecutionProvider"]
-            )
+    path = graph_file(network.eval(), shape)
 
-            run = OnnxProduct(session)
+    def checked(graph: bytes) -> OnnxProduct:
+        run = OnnxProduct(graph)
+        with torch.no_grad():
             torch.testing.assert_close(run(probe), network(probe), rtol=rtol, atol=atol)
+        return run
+
+    if (known := read_graph(path)) is not None:
+        with contextlib.suppress(Exception):
+            return checked(known)
+    try:
+        graph = _exported_graph(network, probe)
+        run = checked(graph)
     except Exception as error:  # exporter and runtime raise classes of their own
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"the network cannot run in ONNX Runtime ({type(error).__name__}: {reason})") from error
+    write_graph(path, graph)
     return run
+
+
+def _exported_graph(network: torch.nn.Module, probe: torch.Tensor) -> bytes:
+    file: Any = io.BytesIO()  # the exporter takes buffers, its types do not say so
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        # The exporter is deprecated. Its successor (dynamo=True) gives the same bits, but takes 8 s instead of
+        # 0.3 s the first time in a process, 1.3 s instead of 0.05 s later, and fails to optimise `Symmetric`.
+        torch.onnx.export(
+            network, (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
+            dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
+        )  # fmt: skip
+    graph: bytes = file.getvalue()
+    return graph
 
 
 @dataclass

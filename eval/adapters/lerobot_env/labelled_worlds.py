@@ -16,8 +16,8 @@ from arena_newton.data.readers.label_decoder import V4Decoder
 from arena_newton.errors import InputError
 from arena_newton.eval.adapters.gym import ArenaVectorEnv, Info, Observations
 from arena_newton.eval.adapters.lerobot_env.policy_worlds import PolicyWorlds
-from arena_newton.eval.folders.recordings import OUTCOMES_FILE, write_actions
-from arena_newton.eval.records.journal import StorageError
+from arena_newton.eval.folders.recordings import OUTCOMES_FILE, packed_actions
+from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.policies.label_reader import measured_yaw
 from arena_newton.policies.lerobot.checkpoint_facts import vector_of
 
@@ -123,7 +123,8 @@ class PolicyVectorEnv(ArenaVectorEnv):
         if self._executed[world]:
             path = folder / "actions" / f"{self.task}_{self.env.mode}_s{group}_r{repeat}.npz"
             seed, gym_id = int(self._episode_seed[world]), self.env.spec.gym_id
-            write_actions(path, self._executed[world], episode_seed=seed, gym_id=gym_id, mode=self.env.mode)
+            content, _ = packed_actions(self._executed[world], episode_seed=seed, gym_id=gym_id, mode=self.env.mode)
+            write_atomic(path, content, "the episodes before are kept")
         self._kept[world] = True
 
 

@@ -1,20 +1,25 @@
 """Audits accuse no honest folder, and find forgeries at the level at which they can be found."""
 
-import csv
-import hashlib
-import io
+import dataclasses
 import json
 import shutil
 
 import numpy as np
 import pytest
-from eval_fakes import factories
+import torch
+from eval_fakes import FakeEnv, FakePolicy, factories
 from made_folders import stored
 
+from arena_newton import policies
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.chain import head
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.eval.workers.shard_merge import merge
+from arena_newton.interfaces import Chunk
+from arena_newton.kernels import tick as codes
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from benchmarks.forgeries import FORGERIES, TABLES, forge, journal_lines, level_of, write_lines
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "5"]
 FLAGS += ["--tracker", "twist2", "sonic"]
@@ -44,25 +49,6 @@ def audit(folder, capsys, *flags):
     return code, found
 
 
-def lines_of(folder):
-    return [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-
-
-def write(folder, lines, *, relink=True):
-    """Write a journal, by default as a forger does who knows the chain."""
-    before, texts = b"", []
-    for line in lines:
-        if relink:
-            line = line | {"previous": hashlib.sha256(before).hexdigest()}
-        before = json.dumps(line, separators=(",", ":")).encode() + b"\n"
-        texts.append(before)
-    (folder / "episodes.jsonl").write_bytes(b"".join(texts))
-
-
-def first(lines, outcome):
-    return next(line for line in lines if line["outcome"] == outcome)
-
-
 def test_the_head_is_the_same_whoever_played(honest, tmp_path, capsys):
     """Order, worlds and shards change the links and not the head, which stands in results, tables and reports."""
     merge([honest / "1", honest / "2"], tmp_path / "m")
@@ -70,7 +56,7 @@ def test_the_head_is_the_same_whoever_played(honest, tmp_path, capsys):
     for name in ("results.json", "table.md", "report.md", "report.html"):
         texts = [(folder / name).read_text() for folder in (honest / "run", tmp_path / "m")]
         assert texts[0] == texts[1] and names in texts[0], name
-    links = [[line["previous"] for line in lines_of(f)] for f in (honest / "run", tmp_path / "m")]
+    links = [[line["previous"] for line in journal_lines(f)] for f in (honest / "run", tmp_path / "m")]
     assert links[0] != links[1] and audit(tmp_path / "m", capsys, "--head", names) == (0, [])
     assert {path.name for path in (tmp_path / "m" / "actions").iterdir()} == {"twist2", "sonic"}
     capsys.readouterr()
@@ -119,183 +105,67 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
     assert capsys.readouterr().err == f"error: {tmp_path}: no results folder (it has no config.json)\n"
 
 
-def edited(of, /, **changes):
-    """Forgery of one line: that of the first episode with an outcome."""
-
-    def forge(folder, lines):
-        line = first(lines, of)
-        line.update({key: value(line) if callable(value) else value for key, value in changes.items()})
-
-    return forge
-
-
-def won(line):
-    """A failure as a careful forger makes a success of it: margin, progress and predicates too, the events removed."""
-    held = {name: line["steps"] for name in line["predicates"]}
-    line |= {"outcome": "success", "reason": "success", "margin": 0.3, "progress": 1.0, "predicates": held}
-    line["events"] = [event for event in line["events"] if event["kind"] != "fall"]
-
-
-def careful(folder, lines):
-    won(first(lines, "timeout"))
-
-
-def careful_with_tables(folder, lines):
-    careful(folder, lines)
-    write(folder, lines)
-    main(["report", str(folder)])
-
-
-def dropped(folder, lines):
-    lines.remove(first(lines, "fall"))
-
-
-def dropped_and_unfinished(folder, lines):
-    dropped(folder, lines)
-    document = json.loads((folder / "config.json").read_text())
-    document["status"]["state"] = "cancelled"
-    (folder / "config.json").write_text(json.dumps(document, indent=2) + "\n")
-
-
-def repeated(folder, lines):
-    lines.append(first(lines, "success"))
-
-
-def exchanged(folder, lines):
-    """The outcome of one episode under the name of another."""
-    keys = ("index", "repeat", "group_seed", "episode_seed", "object_seed")
-    one, other = first(lines, "success"), first(lines, "fall")
-    for key in keys:
-        one[key], other[key] = other[key], one[key]
-
-
-def other_rules(folder, lines):
-    document = json.loads((folder / "config.json").read_text())
-    document["config"]["rules"] = "released"
-    (folder / "config.json").write_text(json.dumps(document, indent=2) + "\n")
-
-
-def in_table(name, change):
-    def forge(folder, lines):
-        path = folder / name
-        path.write_text(change(path.read_text()))
-
-    return forge
-
-
-def cells(text):
-    content = json.loads(text)
-    content["cells"][0]["successes"] += 1
-    return json.dumps(content, indent=2) + "\n"
-
-
-def rates(text):
-    rows = list(csv.reader(io.StringIO(text)))
-    rows[1][rows[0].index("sr")] = "1.0"
-    return "\n".join(",".join(row) for row in rows) + "\n"
-
-
-def actions_of(folder, line):
-    return folder / line["media"]["actions"]
-
-
-def exchanged_actions(folder, lines):
-    """The files of two episodes, with their hashes."""
-    one, other = lines[0], lines[1]
-    data = [actions_of(folder, line).read_bytes() for line in (one, other)]
-    actions_of(folder, one).write_bytes(data[1])
-    actions_of(folder, other).write_bytes(data[0])
-    one["actions"], other["actions"] = other["actions"], one["actions"]
-
-
-def other_actions(folder, lines):
-    path = actions_of(folder, lines[0])
-    with np.load(path) as arrays:
-        np.savez_compressed(path, **dict(arrays) | {"action": arrays["action"] + 1})
-
-
-FORGERIES = {
-    "outcome alone": edited("timeout", outcome="success"),
-    "outcome and reason": edited("timeout", outcome="success", reason="success"),
-    "a timeout to an error": edited("timeout", outcome="error", error="the server was away"),
-    "fall to a timeout": edited("fall", outcome="timeout", reason="timeout"),
-    "margin of a success": edited("success", margin=-0.1),
-    "steps of a success": edited("success", steps=lambda line: line["steps"] - 1),
-    "steps with predicates": edited(
-        "success", steps=3, predicates=lambda line: dict.fromkeys(line["predicates"], 3), phases=[]
-    ),
-    "predicates removed": edited("success", predicates={}),
-    "a predicate renamed": edited("timeout", predicates={"goal": None}),
-    "a predicate after the end": edited("timeout", predicates=lambda line: line["predicates"] | {"approach": 9999}),
-    "progress": edited("timeout", progress=0.75),
-    "event of the fall removed": edited("fall", events=[]),
-    "fall moved past the end": edited("fall", events=[{"kind": "fall", "tick": 1200, "detail": "tilt"}]),
-    "fall at the start": edited("fall", startup_fall=True),
-    "ball out without event": edited("timeout", reason="ball_out"),
-    "a phase after the end": edited("success", phases=[["walk", 0], ["reach", 5000]]),
-    "step budget": edited("success", max_steps=5000),
-    "episode seed": edited("fall", episode_seed=1),
-    "object seed": edited("fall", object_seed=1),
-    "group seed": edited("fall", group_seed=7),
-    "tracker": edited("fall", tracker="pd"),
-    "policy": edited("fall", policy="learned"),
-    "rule set of a line": edited("fall", rules="released"),
-    "engine of a line": edited("fall", engine="warp"),
-    "privileged": edited("success", privileged=True),
-    "hash of the checkpoint": edited("fall", hashes=lambda line: line["hashes"] | {"checkpoint": "0" * 12}),
-    "hash of the libraries": edited("fall", hashes=lambda line: line["hashes"] | {"versions": "0" * 12}),
-    "hash of the environment": edited("fall", hashes=lambda line: line["hashes"] | {"environment": "0" * 12}),
-    "hash of the rules": edited("fall", hashes=lambda line: line["hashes"] | {"rules": "0" * 12}),
-    "duration": edited("success", durations={"wall_s": 1.0, "sim_s": 99.0}),
-    "actions disowned": edited("success", actions=None),
-    "another file of actions": edited("success", media={"actions": "actions/twist2/football_base_s9_r9.npz"}),
-    "hash of the actions": edited("success", actions="0" * 64),
-    "a line dropped": dropped,
-    "a line repeated": repeated,
-    "a line moved": lambda folder, lines: lines.insert(0, lines.pop()),
-    "two episodes exchanged": exchanged,
-    "rule set of the run": other_rules,
-    "results.json": in_table("results.json", cells),
-    "table.csv": in_table("table.csv", rates),
-    "table.md": in_table("table.md", lambda text: text.replace("football", "f00tball", 1)),
-    "report.md": in_table("report.md", lambda text: text.replace("| 5", "| 6", 1) + "\n"),
-    "report.html": in_table("report.html", lambda text: text.replace("success", "failure", 1)),
-    "actions changed": other_actions,
-    "actions exchanged": exchanged_actions,
-    "a careful outcome": careful,
-}
-"""Forgeries by name; the links are made again after each."""
-ALLOWED = ("a line moved",)
-"""Changes that make no result another."""
-BY_HEAD = {
-    "with tables": careful_with_tables,
-    "a line dropped, unfinished": dropped_and_unfinished,
-}
-"""Forgeries that agree with themselves: only a head that was published finds them, or a replay."""
+REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
+REPLAYED |= {"a failure made a success", "every failure made a success"}
+LEVEL = dict.fromkeys(REPLAYED, "replay")
+LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
+"""What finds a forgery, where lines alone do not; the world of these tests heeds no action."""
 
 
 @pytest.mark.parametrize("name", FORGERIES)
-def test_forgeries_are_found_by_lines(folder, capsys, name):
-    """A forger who makes the links again is found by what the folder says elsewhere."""
-    lines = lines_of(folder)
-    FORGERIES[name](folder, lines)
-    write(folder, lines)
-    code, found = audit(folder, capsys)
-    assert (code, bool(found)) == ((0, False) if name in ALLOWED else (1, True)), found
-
-
-@pytest.mark.parametrize("name", BY_HEAD)
-def test_forgeries_are_found_by_the_published_head(folder, capsys, name):
-    """A folder whose line, links and tables were edited agrees with itself, and not with the published head."""
+def test_forgeries_are_found(folder, name):
+    """A forger who makes links and tables again is found by the lines, by a replay or by the published head."""
     published = json.loads((folder / "results.json").read_text())["head"]
-    lines = lines_of(folder)
-    BY_HEAD[name](folder, lines)
-    write(folder, lines)
-    shutil.rmtree(folder / "original")
-    main(["report", str(folder)])
-    assert audit(folder, capsys) == (0, [])
-    code, found = audit(folder, capsys, "--head", published)
-    assert code == 1 and len(found) == 1 and f"published was {published}" in found[0]
+    forge(folder, FORGERIES[name], tables=name not in TABLES)
+    level, found = level_of(folder, published, factories=factories())
+    assert bool(found) and level == LEVEL.get(name, "lines"), found
+
+
+class Other(FakePolicy):
+    """A policy that decides otherwise; recordings are played as they are."""
+
+    def act(self, observation):
+        chunk = super().act(observation)
+        return chunk if self.name.startswith("replay:") else Chunk(chunk.actions + 0.5)
+
+
+class Losing(FakeEnv):
+    """A world in which nobody succeeds."""
+
+    def step(self, action, worlds=None):
+        status = super().step(action, worlds)
+        return np.where(status == codes.SUCCESS, codes.FALL, status)
+
+
+def test_another_policys_actions_are_found(honest, capsys):
+    """The policy is asked again at its own queries: the run's own decides as recorded, another one is found."""
+    asked = ["audit", str(honest / "run"), "--replay", "6", "--draw", "7", "--policy", "stand"]
+    assert main(asked, factories()) == 0
+    said = capsys.readouterr().out
+    assert "level re-run" in said and "actions are equal to the bit" in said and "47% if 10% are forged" in said
+    assert main([*asked, "--tolerance", "0.4"], factories(policy=Other)) == 1
+    said = capsys.readouterr().out
+    assert said.count("at tick 0 the policy decides otherwise; actions differ by up to 0.5") == 6
+    assert main([*asked, "--tolerance", "0.5"], factories(policy=Other)) == 0
+
+
+def test_a_rate_that_new_seeds_do_not_have_is_found(honest, capsys):
+    """New episodes on seeds of the auditor: the claimed rate is confirmed, one that is far off contradicts."""
+    fresh = ["audit", str(honest / "run"), "--policy", "stand", "--fresh", "100"]
+    assert main(fresh, factories()) == 0
+    said = capsys.readouterr().out
+    assert said.count("Fresh episodes: ") == 4 and "level consistent" in said and "fresh 400" in said
+    assert main(fresh, factories(env=Losing)) == 1
+    assert "0 of 100 succeed on group seed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "flags", [("--policy", "stand"), ("--fresh", "3"), ("--tolerance", "-1"), ("--replay", "-1"), ("--fresh", "-1")]
+)
+def test_flags_that_do_nothing_are_refused(honest, capsys, flags):
+    """A flag that lacks its other one, or is out of range, is a line and code 2."""
+    assert main(["audit", str(honest / "run"), *flags], factories()) == 2
+    assert capsys.readouterr().err.startswith(f"error: {flags[0]}")
 
 
 @pytest.mark.parametrize(
@@ -309,8 +179,65 @@ def test_forgeries_are_found_by_the_published_head(folder, capsys, name):
 )
 def test_a_broken_link_is_named(folder, capsys, change, number):
     """A line that was changed or dropped without its links breaks the next one, whatever it says."""
-    lines = lines_of(folder)
+    lines = journal_lines(folder)
     change(lines)
-    write(folder, lines, relink=False)
+    write_lines(folder, lines, link=False)
     code, found = audit(folder, capsys)
     assert code == 1 and any(f"line {number} is not linked to line {number - 1}: " in line for line in found), found
+
+
+class Seeing(FakePolicy):
+    """A policy that stands, sees a small picture, and moves its first joint by how bright that is."""
+
+    needs_image = True
+    camera = CameraConfig(width=32, height=24, fit="native")
+    chunk_size = 4
+
+    def act(self, observation):
+        actions = torch.tensor(STAND_ACTION).repeat(len(observation.mask), self.chunk_size, 1)
+        actions[:, :, ACTION["joint_pos"].start] += observation.image.float().mean(dim=(1, 2, 3))[:, None] / 2550
+        return Chunk(actions)
+
+
+def test_pictures_are_drawn_again(parts, tmp_path, capsys):
+    """A replay draws with its stored camera what the policy was shown; a policy that was shown more is found."""
+    made = dataclasses.replace(
+        parts, policy=lambda spec, **options: (policies.get if spec.startswith("replay") else Seeing)(spec, **options)
+    )
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "mujoco", "--repeats", "2", "--seeds", "0"]
+    assert main([*flags, "--out", str(tmp_path / "run")], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 0
+    assert main(["audit", str(tmp_path / "run"), "--all", "--policy", "stand"], made) == 0
+    assert "level re-run" in capsys.readouterr().out
+    forge(tmp_path / "run", lambda folder, lines: shown_otherwise(folder))
+    assert main(["audit", str(tmp_path / "run"), "--all"], made) == 1
+    assert capsys.readouterr().out.count("shown is") == 2
+
+
+def shown_otherwise(folder):
+    """The policy is said to have had another camera."""
+    content = json.loads((folder / "config.json").read_text())
+    content["environments"]["football twist2 base"]["cameras"]["front"]["width"] = 28
+    (folder / "config.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
+    """States that engine warp recorded follow from each other on engine mujoco; a step aside between two is found."""
+    run, bare = tmp_path / "run", tmp_path / "bare"
+    flags = ["run", "--task", "football", "--policy", "stand", "--engine", "warp", "--device", "cpu", "--seeds", "0"]
+    flags += ["--repeats", "2", "--worlds", "2"]
+    assert main([*flags, "--out", str(bare)], parts) == 0
+    assert main([*flags, "--record", "--record-cameras", "--out", str(run)], parts) == 0
+    assert main(["audit", str(bare), "--all"], parts) == 2
+    assert "ticks are checked one by one where states were recorded (--record)" in capsys.readouterr().err
+    assert main(["audit", str(run), "--all"], parts) == 0
+    said = capsys.readouterr().out
+    assert "level replayed" in said and "each tick was checked on mujoco" in said
+    path = next((run / "episodes").glob("*repeat0000.npz"))
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["arena_qpos"][7:, 0] += 0.05
+    np.savez_compressed(path, **arrays)
+    assert main(["audit", str(run), "--all"], parts) == 1
+    (found,) = (line for line in capsys.readouterr().out.splitlines() if "contradiction: " in line)
+    assert "the state after tick 6 is 0.05 m from what mujoco gives" in found

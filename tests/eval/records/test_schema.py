@@ -20,7 +20,7 @@ from arena_newton.files.stored_json import Fit
 from arena_newton.interfaces import EpisodeEvent, EpisodeResult
 
 NEW_KEYS = ("schema", "phases", "predicates", "progress", "events")
-RAN = {1: ("stand", 20), 2: ("expert", 150), 3: ("expert", 150)}
+RAN = {1: ("stand", 20), 2: ("expert", 150), 3: ("expert", 150), 4: ("expert", 150)}
 """Schema → policy and steps of its run."""
 
 

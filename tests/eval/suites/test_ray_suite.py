@@ -16,13 +16,14 @@ from made_folders import SUITE, contents, journals
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.play import run
 from arena_newton.eval.suites.suite_records import load_cell, read_suite
 from arena_newton.eval.workers.shard_merge import merge
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.workers import local_backend, ray_backend, worker_pool  # noqa: E402
+from arena_newton.eval.workers import dealing, local_backend, ray_backend, worker_pool  # noqa: E402
 from arena_newton.eval.workers.actor import EpisodeActor  # noqa: E402
 from arena_newton.eval.workers.backend import WorkerLost  # noqa: E402
 from arena_newton.eval.workers.messages import Done, Node  # noqa: E402
@@ -226,6 +227,32 @@ def test_interrupted_and_continued(inline, suite, alone, tmp_path, capsys):
     assert journals(out) == journals(alone)
     documents = [json.loads(path.read_text()) for path in out.glob("*/*/*/*/config.json")]
     assert {document["status"]["state"] for document in documents} == {"success"} and len(documents) == 6
+
+
+def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch):
+    """Experts and the policy that sees are played by the same two processes, into the folder of each."""
+    monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
+    fake, out = inline(), tmp_path / "out"
+    assert main(["--device", "cpu", "--jobs", "2", "--out", str(out)], factories()) == 0
+    assert fake.actors == 2 and {folder for _, folder in fake.opened} == {str(out), str(out / "learned")}
+    for folder in (out, out / "learned"):
+        assert json.loads((folder / "results.json").read_text())["complete"]
+
+
+@pytest.mark.parametrize(("cores", "viewer", "jobs"), [(8, (), 2), (1, (), 1), (2, ("--viewer", "usd"), 1)])
+def test_two_processes_play_the_default_run(tmp_path, monkeypatch, cores, viewer, jobs):
+    """Where there are two cores, and no viewer that shows worlds of this process."""
+    played = []
+
+    def execute(folders, factories):
+        played.append((folders[0] if isinstance(folders, list) else folders).config.flags.jobs)
+        return 0
+
+    monkeypatch.setattr(dealing, "execute", execute)
+    monkeypatch.setattr(run, "execute", execute)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)))
+    assert main(["--device", "cpu", *viewer, "--out", str(tmp_path / "out")]) == 0
+    assert set(played) == {jobs}
 
 
 class Ignorant(FakePolicy):

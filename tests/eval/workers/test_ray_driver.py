@@ -1,5 +1,6 @@
 """The driver of `run --ray` and the messages of processes: nothing is lost, nothing counts twice."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -55,7 +56,7 @@ class StubPool:
                 assignment.worlds,
                 self.folder.document["config_hash"],
             )
-            play(part, self.folder.config, self.folder.path, self.made_of, self.policy, told.append)
+            play(part, self.folder.config, Path("/no/shared/disk"), self.made_of, self.policy, told.append)
             loss = self.lost(assignment, told)
             for event in told if loss is None else told[: loss[0]]:
                 yield assignment.job, assignment, event
@@ -91,8 +92,9 @@ def outcomes(records):
 
 
 def test_batches_cover_the_plan_once(driven, tmp_path):
-    """All episodes are played once in batches of at most twice the worlds, with a run's outcomes."""
-    records, pool, _ = driven()
+    """Episodes play once in batches of at most twice the worlds, as in a run; actions come without shared disk."""
+    records, pool, folder = driven()
+    assert all((folder.path / record.media["actions"]).is_file() for record in records)
     plan = ["--task", "football", "boxing", "--mode", *MODES, "--seeds", "0", "1", "--repeats", "2"]
     assert main(["run", *plan, "--engine", "mujoco", "--out", str(tmp_path / "one")], factories()) == 0
     assert outcomes(records) == outcomes(read_journal(tmp_path / "one" / "episodes.jsonl")[0])

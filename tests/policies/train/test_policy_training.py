@@ -1,9 +1,7 @@
 """Trainings of a narrow ACT on the CPU: result, resume, signals, several processes, errors."""
 
-import contextlib
 import csv
 import dataclasses
-import itertools
 import json
 import os
 import random
@@ -28,24 +26,21 @@ from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, chec
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train import (
-    policy_trainer,
     training,
     training_log,
     training_loop,
     training_state,
 )
 from arena_newton.policies.train.__main__ import main
-from arena_newton.policies.train.families import families
-from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
 from arena_newton.policies.train.frames.frame_store import load_frames
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import train
-from benchmarks.made_frames import made_frames
 from tests.children import Child
 from tests.fuzz.mutants import damaged
 from tests.policies.train import narrow_network
+from tests.policies.train.plain_trainer import plain_trainer
 from tests.policies.train.small_dataset import info, make_dataset, padded
 from tests.policies.train.stock_lerobot import opened, raw_observation
 
@@ -282,107 +277,6 @@ def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
     assert not torch.distributed.is_initialized()
 
 
-def test_processes_that_differ_are_refused(monkeypatch):
-    """Weights that drift apart end a training of several processes before they are saved."""
-    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, source: None)
-    trainer = plain_trainer(monkeypatch, 2, ranks=2)
-    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: None)
-    trainer.check_agreement()
-    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, operation: tensor.add_(float(operation)))
-    with pytest.raises(ArenaError, match="2 processes hold different weights"):
-        trainer.check_agreement()
-
-
-def plain_trainer(monkeypatch, batch, rank=0, ranks=1, store=None, **more):
-    """A trainer whose loss is a mean over the batch and draws nothing: no dropout, latent, augmentation or padding."""
-    network = {"dropout": 0.0, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
-    settings = recipe("act", "small", network=network, chunk=1, horizon=1, batch_norm=False)
-    settings = dataclasses.replace(settings, batch_size=batch, shift_px=0, colour=0.0, steps=6, warmup_steps=0, **more)
-    torch.manual_seed(0)
-    zeros, ones = torch.zeros(64), torch.ones(64)
-    stats = {"observation.state": {"mean": zeros, "std": ones}, "action": {"mean": zeros[:40], "std": ones[:40]}}
-    model = families.build(settings, stats, "cpu")
-    store = made_frames(40, 64, torch.device("cpu")) if store is None else store
-    batches = BatchMaker(store, model.normalise, model.samples)
-    return PolicyTrainer(model, batches, settings, rank=rank, ranks=ranks)
-
-
-def test_the_last_steps_keep_the_statistics_of_the_encoder(monkeypatch):
-    """In the last fraction of the steps that a recipe names the encoder's weights change and its statistics do not."""
-    trainer = plain_trainer(monkeypatch, 2, batch_norm=True, frozen_norms=0.5)
-    norm = next(m for m in trainer.model.policy.modules() if isinstance(m, torch.nn.BatchNorm2d))
-    means, scales = [norm.running_mean.clone()], [norm.weight.detach().clone()]
-    for _ in range(6):
-        trainer.advance()
-        trainer.held_out_losses()
-        means.append(norm.running_mean.clone())
-        scales.append(norm.weight.detach().clone())
-    assert [not torch.equal(a, b) for a, b in itertools.pairwise(means)] == [True] * 3 + [False] * 3
-    assert not any(torch.equal(a, b) for a, b in itertools.pairwise(scales))
-
-
-def test_a_compiled_network_with_another_gradient_is_refused(monkeypatch):
-    """A compiler whose gradient is wrong is named before the first step; one that is right changes no bit."""
-    plain, right, wrong = (plain_trainer(monkeypatch, 2, batch_norm=True) for _ in range(3))
-    factor = []
-
-    @contextlib.contextmanager
-    def uncompiled():
-        factor.append(1.0)
-        yield
-        factor.pop()
-
-    def losses(batch, noise):
-        loss, each = real(batch, noise)
-        return loss * (factor or [1000.0])[-1], each
-
-    monkeypatch.setattr(policy_trainer, "uncompiled", uncompiled)
-    real = wrong.model.losses
-    monkeypatch.setattr(wrong.model, "losses", losses)
-    right._agrees = wrong._agrees = False
-    plain.advance()
-    right.advance()
-    pairs = zip(plain.model.policy.parameters(), right.model.policy.parameters(), strict=True)
-    assert all(torch.equal(one, other) for one, other in pairs)
-    with pytest.raises(ArenaError, match=r"--compile: step 0: the compiled network's gradient .* compiles it wrongly"):
-        wrong.advance()
-    assert wrong.step == 0
-
-
-def test_two_processes_take_the_step_of_one_with_twice_the_batch(monkeypatch):
-    """The mean of two processes' gradients is that of both batches together, and both end with the same weights."""
-    one = plain_trainer(monkeypatch, 4)
-    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, source: None)
-    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor: None)
-    pair = [plain_trainer(monkeypatch, 2, rank, 2) for rank in range(2)]
-    for _ in range(3):
-        one.advance()
-        for trainer in pair:  # what `advance` does, with the exchange in the middle
-            trainer._prepare(trainer.step)
-            trainer._descend()
-        total = pair[0]._flat + pair[1]._flat
-        for trainer in pair:
-            trainer._flat.copy_(total)
-            trainer._average()
-            trainer._update()
-            trainer.step += 1
-    single, first, second = (t.model.policy.state_dict() for t in (one, *pair))
-    for name in single:
-        assert torch.equal(first[name], second[name]), name
-        assert torch.allclose(single[name], first[name], atol=2e-5), name
-
-
-def test_training_lowers_the_loss(monkeypatch):
-    """Forty steps on forty rows: the loss of rows that are trained on falls by a fifth at least."""
-    trainer = plain_trainer(monkeypatch, 20, lr=5e-3, lr_backbone=5e-3)
-    trainer.fix_steps(40)
-    losses = []
-    for _ in range(40):
-        trainer.advance()
-        losses.append(float(trainer.loss))
-    assert sum(losses[-4:]) < 0.8 * sum(losses[:4]), losses
-
-
 def a_second_a_step(monkeypatch):
     """A clock by which each step takes a second."""
     clock = [1000.0]
@@ -489,7 +383,7 @@ def test_a_policy_that_is_not_given_its_tracker(pairs, tmp_path):
 def test_losses_of_pairs_sum_to_the_whole(pairs, monkeypatch):
     """Weighed by their samples, losses of pairs are the loss of the step, and held-out ones that of all rows."""
     store = load_frames([read_rows(one, "v4") for one in pairs], torch.device("cpu"), hold_out=1, jobs=1)
-    trainer = plain_trainer(monkeypatch, 16, store=store)
+    trainer = plain_trainer(16, store=store)
     for _ in range(2):
         before = dict(trainer.drawn)
         trainer.advance()
@@ -597,7 +491,7 @@ def test_a_folder_is_not_overwritten_nor_mixed(dataset, whole, tmp_path, capsys)
 def test_damaged_states_are_refused_by_name(whole, tmp_path, monkeypatch, mutants):
     """Damaged progress files, optimizer states and weights: accepted, or one error with the file's name."""
     checkpoint = shutil.copytree(whole / "checkpoints" / "000008", tmp_path / "c")
-    trainer = plain_trainer(monkeypatch, 2)
+    trainer = plain_trainer(2)
     trainer.model.save(checkpoint / "pretrained_model", CheckpointFacts())
     trainer.advance()
     training_state._write_optimizer(trainer.optimizer, checkpoint / "training_state")

@@ -1,0 +1,188 @@
+"""The documentation as a site: these pages, the examples and the public names, with search.
+
+    uv run python docs/build.py --out site
+
+Pages remain as they are. Copies of them, and pages made of examples, glossary and docstrings, are written to a
+temporary folder, which Sphinx turns into HTML. A warning is an error: exit code 1.
+"""
+
+import argparse
+import ast
+import importlib.util
+import os
+import re
+import shutil
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+
+import api_reference
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+READING = {
+    "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
+    "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
+        docs/design/identity""",
+    "How-to": """docs/policies docs/serving docs/trackers docs/authoring docs/experts docs/recording docs/datasets
+        docs/curation docs/training docs/suites docs/machines docs/comparing docs/sensitivity docs/auditing
+        docs/teleoperation docs/gym docs/motions docs/gradients docs/api examples/index""",
+    "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
+        CHANGELOG""",
+    "Results": """docs/results/README docs/results/findings policies/weights/learned/card eval/tables/paper/README
+        docs/certificate docs/performance""",
+}
+"""Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
+EXAMPLES = """first_episode own_policy own_tracker drive_by_code usd_variant record_and_build swap aim_a_kick
+    refine_reference compare_runs""".split()
+CONFIGURATION = {
+    "project": PROJECT["name"],
+    "copyright": "The arena_newton contributors, Apache-2.0",
+    "release": PROJECT["version"],
+    "extensions": ["myst_parser"],
+    "root_doc": "index",
+    "smartquotes": False,
+    "html_theme": "pydata_sphinx_theme",
+    "html_title": "arena_newton",
+    "html_theme_options": {
+        "show_prev_next": True,
+        "navigation_with_keys": False,
+        "show_nav_level": 1,
+        "secondary_sidebar_items": ["page-toc"],
+        "footer_start": ["copyright"],
+        "footer_end": [],
+    },
+    "html_sidebars": {"index": []},
+    "html_show_sourcelink": False,
+    "html_copy_source": False,
+    "myst_heading_anchors": 4,
+    "python_maximum_signature_line_length": 80,
+    # A type that several modules export is explained once and named in short everywhere.
+    "suppress_warnings": ["ref.python"],
+}
+
+
+def page_links(text: str, page: Path, folder: Path) -> str:
+    """A page with links that lead to other pages of the site, or to copies of the files that it names.
+
+    Args:
+        text: The page.
+        page: Its path in the repository, relative to the root.
+        folder: Where pages are collected.
+    """
+
+    def one(match: re.Match[str]) -> str:
+        shown, target = match[1], match[2]
+        path, _, heading = target.partition("#")
+        if not path or "://" in target:
+            return match[0]
+        file = Path(os.path.normpath(page.parent / path))
+        if (ROOT / file).is_dir():
+            if file.name != "examples":
+                return shown
+            file = file / "index.md"
+        elif file == Path("README.md"):
+            file = Path("index.md")
+        elif file.parent == Path("examples") and file.stem in EXAMPLES:
+            file = file.with_suffix(".md")
+        elif file.suffix != ".md" and not (folder / file).exists():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / file, folder / file)
+        return f"[{shown}]({os.path.relpath(file, page.parent)}{'#' if heading else ''}{heading})"
+
+    return re.sub(r"\[((?:[^\[\]]|\[[^\]]*\]|!\[[^\]]*\]\([^)]*\))*)\]\(([^)\s]+)\)", one, text)
+
+
+def table_of_contents(pages: Iterable[str], hidden: bool = False) -> str:
+    """A list of the pages below this one."""
+    options = ":hidden:\n" if hidden else ""
+    return f"\n```{{toctree}}\n{options}:maxdepth: 1\n\n" + "\n".join(pages) + "\n```\n"
+
+
+def example_page(name: str) -> str:
+    """An example: what it shows, its pictures, its source."""
+    source = (ROOT / "examples" / f"{name}.py").read_text()
+    said = ast.get_docstring(ast.parse(source)) or ""
+    pictures = sorted((ROOT / "docs" / "examples").glob(f"{name}*"))
+    shown = "".join(f"\n![What {name}.py shows](../docs/examples/{picture.name})\n" for picture in pictures)
+    return f"# {name}.py\n\n{said}\n{shown}\n```python\n{source}```\n"
+
+
+def collect(folder: Path) -> None:
+    """Write all pages of the site as Markdown, with their pictures, into a folder."""
+    shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    listed = {ROOT / f"{page}.md" for pages in READING.values() for page in pages.split()}
+    for path in {ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *filter(Path.is_file, listed)}:
+        name = path.relative_to(ROOT)
+        text = page_links((ROOT / name).read_text(), name, folder)
+        if name.name == "README.md" and name.parent == Path():
+            text += table_of_contents([part.lower() for part in READING], hidden=True)
+            name = Path("index.md")
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    for part, within in READING.items():
+        (folder / f"{part.lower()}.md").write_text(f"# {part}\n{table_of_contents(within.split())}")
+    words = (ROOT / "CONTRIBUTING.md").read_text().split("## Glossary\n")[1].split("\n## ")[0]
+    (folder / "docs" / "glossary.md").write_text(f"# Glossary\n{words}")
+    (folder / "examples").mkdir(exist_ok=True)
+    for example in EXAMPLES:
+        (folder / "examples" / f"{example}.md").write_text(example_page(example))
+    first = "# Examples\n\nShort programs, in the order of reading.\n"
+    (folder / "examples" / "index.md").write_text(first + table_of_contents(EXAMPLES))
+    (folder / "api").mkdir()
+    for module, text in api_reference.pages().items():
+        (folder / "api" / f"{module}.md").write_text(text)
+    first = "# Public names\n\nModules for programs of your own, with all that they export.\n"
+    (folder / "api" / "index.md").write_text(first + table_of_contents(api_reference.MODULES))
+
+
+def llms(folder: Path) -> str:
+    """The file `llms.txt`: the project in a sentence, and each page with its title, by parts of the site."""
+    lines = [f"# {PROJECT['name']}", "", f"> {PROJECT['description']}"]
+    for part, pages in READING.items():
+        lines += ["", f"## {part}", ""]
+        for page in pages.split():
+            title = (folder / f"{page}.md").read_text().splitlines()[0].removeprefix("# ")
+            lines.append(f"- [{title}]({page}.html)")
+    return "\n".join(lines) + "\n"
+
+
+def build(out: Path) -> int:
+    """Build the site.
+
+    Args:
+        out: Folder of the site; what it holds is replaced.
+
+    Returns:
+        0, or 1 if Sphinx warned.
+    """
+    from sphinx.application import Sphinx
+
+    with tempfile.TemporaryDirectory() as name:
+        pages, trees = Path(name) / "pages", Path(name) / "trees"
+        pages.mkdir()
+        collect(pages)
+        site = Sphinx(pages, None, out, trees, "html", CONFIGURATION, status=None, warningiserror=True)
+        site.build(force_all=True)
+        (out / "llms.txt").write_text(llms(pages))
+        return site.statuscode
+
+
+def main() -> int:
+    """Build the site that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("site"), help="folder of the site")
+    out = parser.parse_args().out
+    if importlib.util.find_spec("sphinx") is None:
+        print("docs/build.py: needs the extra [docs] (sphinx is not installed): uv sync --extra docs", file=sys.stderr)
+        return 2
+    code = build(out)
+    if not code:
+        print(f"open {out / 'index.html'}")
+    return code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
