@@ -27,6 +27,9 @@ SKIN_SOLREF = (-0.01, -0.01)
 SKIN_SOLIMP = (0.9, 0.001, 0.002, 0.5, 2.0)
 """Stiffness 10,000/s² and damping 10/s, times the last impedance by which MuJoCo divides them; the impedance fades from
 0.9 at the surface to nothing 2 mm deep, so that an impact, which is deeper, feels the inner contact alone."""
+SKIN_SOLIMP_WARP = (*SKIN_SOLIMP[:4], 1.0)
+"""The same on engine `warp`, but fading along a line: mujoco_warp 3.17 clamps every other curve that falls with depth
+to its last impedance, and the ball then slides as on ice. Both curves are 0.45 at the depth of 1 mm."""
 
 
 def ball_solref(restitution: float, dt: float) -> tuple[float, float]:
@@ -101,10 +104,10 @@ def set_restitution(scene: Scene, restitution: float, dt: float, *models: mujoco
         InputError: The ball has no collision geometry.
     """
     contacts = {g: (ball_solref(restitution, dt), BALL_SOLIMP) for g in scene.geom_ids(BALL)}
-    for geom, label in enumerate(scene.geom_labels):
-        if label == BALL_SKIN:
-            contacts[geom] = SKIN_SOLREF, SKIN_SOLIMP
+    skins = [geom for geom, label in enumerate(scene.geom_labels) if label == BALL_SKIN]
     for model in models or (scene.mj_model, getattr(scene.solver, "mjw_model", None)):
+        solimp = SKIN_SOLIMP if isinstance(model, mujoco.MjModel) else SKIN_SOLIMP_WARP
+        contacts |= dict.fromkeys(skins, (SKIN_SOLREF, solimp))
         for k, name in enumerate(("geom_solref", "geom_solimp")):
             array = getattr(model, name, None)
             if array is None:

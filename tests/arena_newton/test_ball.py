@@ -30,28 +30,37 @@ def drops(request):
     return request.param, built
 
 
-def bounce(drops, restitution: float, dt: float, steps: int) -> np.ndarray:
-    """Speed of parting over speed of approach, shape [heights, phases]."""
+def thrown(drops, restitution: float, dt: float, height, velocity):
+    """Physics whose balls start at these heights over the grass [m] with these velocities [worlds, 6], and q̇'s address.
+
+    The robots are out of the way.
+    """
     engine, built = drops
     built = dataclasses.replace(built, ball_restitution=restitution)
     physics = make_physics(built, RATES[dt], engine, 1)
-    speed = np.repeat(np.sqrt(2 * GRAVITY * HEIGHTS), len(PHASES))
-    phase = np.tile(PHASES, len(HEIGHTS))
     q, v = built.joint_qpos(BALL), built.joint_qvel(BALL)
     qpos, worlds = physics.qpos0.copy(), np.arange(physics.worlds)
     qpos[:, built.robot.root_qpos] += 50.0
-    # After one free step the ball is a part of a step's way above the ground, after the next one in it.
-    drop = speed * dt * (2.0 - phase)
-    qpos[:, q : q + 3] = np.stack([np.full_like(drop, 3.5), np.full_like(drop, -4.0), RADIUS + drop], axis=1)
+    qpos[:, q : q + 2] = 3.5, -4.0
+    qpos[:, q + 2] = RADIUS + height
     none = np.zeros((physics.worlds, 0, 3)), np.zeros((physics.worlds, 0, 4))
     physics.reset_worlds(worlds, qpos, *none)
     if engine == "mujoco":
         for w in worlds:
-            physics.data[w].qvel[v + 2] = -speed[w]
+            physics.data[w].qvel[v : v + 6] = velocity[w]
     else:
         qvel = physics.qvel.numpy()
-        qvel[:, v + 2] = -speed
+        qvel[:, v : v + 6] = velocity
         physics.qvel.assign(qvel)
+    return physics, q, v
+
+
+def bounce(drops, restitution: float, dt: float, steps: int) -> np.ndarray:
+    """Speed of parting over speed of approach, shape [heights, phases]."""
+    speed = np.repeat(np.sqrt(2 * GRAVITY * HEIGHTS), len(PHASES))
+    phase = np.tile(PHASES, len(HEIGHTS))
+    # After one free step the ball is a part of a step's way above the ground, after the next one in it.
+    physics, _, v = thrown(drops, restitution, dt, speed * dt * (2.0 - phase), np.outer(-speed, np.eye(6)[2]))
     fastest, slowest = np.full(physics.worlds, -np.inf), np.zeros(physics.worlds)
     for _ in range(steps):
         physics.step()
@@ -136,6 +145,24 @@ def test_a_sliding_ball_stays_down(rule_set):
             top = max(top, float(data.qpos[q + 2]) - RADIUS)
         assert top < 5e-3
         assert data.qvel[v + 1] == pytest.approx(3.0 * 5 / 7, abs=0.05), "of a solid sphere five sevenths are left"
+
+
+def test_the_ball_rests_rolls_and_slides_alike_on_both_engines(drops):
+    """At rest it stays on the grass, rolling it keeps its speed, sliding at 3 m/s it stays down and starts to roll."""
+    starts = np.zeros((3, 6))
+    starts[1:, 1] = 0.9, 3.0
+    starts[1, 3] = -0.9 / RADIUS
+    physics, q, v = thrown(drops, 0.1, 0.005, 0.0, np.repeat(starts, drops[1].worlds // 3, axis=0))
+    top = 0.0
+    for _ in range(80):
+        physics.step()
+        top = np.maximum(top, physics.qpos.numpy()[:, q + 2] - RADIUS)
+    height, speed = physics.qpos.numpy()[:, q + 2] - RADIUS, physics.qvel.numpy()[:, v + 1]
+    resting, rolling, sliding = np.split(np.arange(physics.worlds), 3)
+    assert (height > -3e-4).all() and (height < SKIN_HEIGHT + 3e-4).all() and (top < 5e-3).all()
+    assert speed[resting] == pytest.approx(0.0, abs=0.01)
+    assert speed[rolling] == pytest.approx(0.9, abs=0.01)
+    assert speed[sliding] == pytest.approx(3.0 * 5 / 7, abs=0.1)
 
 
 def test_scene_keeps_the_rule_sets_restitution():
