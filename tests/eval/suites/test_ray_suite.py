@@ -229,13 +229,20 @@ def test_interrupted_and_continued(inline, suite, alone, tmp_path, capsys):
     assert {document["status"]["state"] for document in documents} == {"success"} and len(documents) == 6
 
 
-def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch):
-    """Experts and the policy that sees are played by the same two processes, into the folder of each."""
+def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch, capsys):
+    """Experts and the policy that sees are played by the same two processes; a line says so before they load."""
+    said, opened = [], dealing.WorkerPool.opened
+    monkeypatch.setattr(
+        dealing.WorkerPool, "opened", lambda *given: (said.append(capsys.readouterr().err), opened(*given))[1]
+    )
     monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
     fake, out = inline(), tmp_path / "out"
     assert main(["--device", "cpu", "--jobs", "2", "--out", str(out)], factories()) == 0
     assert fake.actors == 2 and {folder for _, folder in fake.opened} == {str(out), str(out / "learned")}
-    for folder in (out, out / "learned"):
+    folders = out, out / "learned"
+    episodes = sum(len((folder / "episodes.jsonl").read_text().splitlines()) for folder in folders)
+    assert said[0].endswith(f"  loading tracker and policy for {episodes} episodes; processes: 2\n")
+    for folder in folders:
         assert json.loads((folder / "results.json").read_text())["complete"]
 
 
