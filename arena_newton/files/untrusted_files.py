@@ -17,7 +17,7 @@ import numpy as np
 from arena_newton.errors import InputError
 from arena_newton.files import limits
 
-__all__ = ["array_digest", "check_size", "create", "file_digest", "numbers", "read_arrays", "read_bytes"]
+__all__ = ["array_digest", "check_size", "create", "file_digest", "numbers", "read_arrays", "read_bytes", "zip_members"]
 _HEADERS: dict[tuple[int, int], Callable[..., tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -90,6 +90,22 @@ def file_digest(path: Path, most: int) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
+def zip_members(archive: zipfile.ZipFile, where: str, most: int) -> list[zipfile.ZipInfo]:
+    """Members of an archive, each stored or deflated: of other methods a read of few bytes unpacks all that follow.
+
+    Raises:
+        InputError: There are more than `most`, or one is packed by another method.
+    """
+    members = archive.infolist()
+    if len(members) > most:
+        raise InputError(f"{where}: holds {len(members):,} members, expected at most {most:,}")
+    for one in members:
+        if one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            name = one.filename[:60]
+            raise InputError(f"{where}: {name!r} is packed by method {one.compress_type}, expected deflate or none")
+    return members
+
+
 def array_digest(arrays: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of arrays by name, data type, shape and content, however a file packs them; 64 hex digits."""
     digest = hashlib.sha256()
@@ -127,11 +143,8 @@ def read_arrays(
             size = len(content)
         allowed = max(limits.ARRAY_BYTES, limits.ARRAY_GROWTH * size)
         with zipfile.ZipFile(path if content is None else io.BytesIO(content)) as archive:
-            members = archive.infolist()
-            if len(members) > limits.ARCHIVE_MEMBERS:
-                raise InputError(f"{where}: holds {len(members)} members, expected at most {limits.ARCHIVE_MEMBERS}")
             arrays, total = {}, 0
-            for member in members:
+            for member in zip_members(archive, where, limits.ARCHIVE_MEMBERS):
                 name = member.filename.removesuffix(".npy")
                 if chosen is not None and name not in chosen:
                     arrays[name] = np.empty(0)

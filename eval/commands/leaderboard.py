@@ -41,6 +41,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
         InputError: An entry is unfit, or there is none.
         StorageError: A page cannot be written.
     """
+    import re
     import tempfile
 
     from arena_newton.cli.flags import check_least, user_path
@@ -57,6 +58,9 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
     entries = named or sorted(path.parent for path in Path("leaderboard").glob(f"*/{ENTRY_FILE}"))
     if not entries:
         raise InputError(f"leaderboard: no {ENTRY_FILE} in leaderboard/*; name the folders of entries")
+    for entry in entries:
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", entry.name):
+            raise InputError(f"leaderboard: {entry}: a page is named by its entry's folder: letters, digits and _ . -")
     if len({entry.name for entry in entries} | {"index"}) <= len(entries):
         raise InputError(f"leaderboard: two entries of one name, or one named index: {' '.join(map(str, entries))}")
     out = user_path(options.out)

@@ -21,7 +21,7 @@ from arena_newton.eval.records.journal import JOURNAL_FILE
 from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.tables.episode_table import cells_of
 from arena_newton.files.stored_json import read_regular
-from arena_newton.files.untrusted_files import create
+from arena_newton.files.untrusted_files import create, zip_members
 
 __all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strips_of", "unpack"]
 
@@ -120,15 +120,15 @@ def unpack(path: Path, digest: str, into: Path) -> str | None:
         return f"{path}: SHA-256 is {found}, its entry says {digest}"
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = archive.infolist()
-            if sum(one.file_size for one in members) > MAX_UNPACKED_BYTES or len(members) > MAX_FILES:
-                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED_BYTES:,} bytes or {MAX_FILES:,} files")
+            members = zip_members(archive, str(path), MAX_FILES)
+            if sum(one.file_size for one in members) > MAX_UNPACKED_BYTES:
+                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED_BYTES:,} bytes")
             for one in members:
                 if not _MEMBER.fullmatch(one.filename):
                     raise InputError(f"{path}: {one.filename[:60]!r} is no file of a bundle")
                 (into / one.filename).parent.mkdir(parents=True, exist_ok=True)
-                with create(into / one.filename) as file:
-                    file.write(archive.read(one))
+                with create(into / one.filename) as file, archive.open(one) as packed:
+                    file.write(packed.read(one.file_size))  # no more, whatever its stream holds
     except InputError:
         raise
     except Exception as error:  # a damaged archive fails anywhere inside zipfile

@@ -111,3 +111,12 @@ def test_a_file_is_known_by_its_digest(tmp_path):
     for refused, said in faults.items():
         with pytest.raises(InputError, match=f"{refused}: .*{said}"):
             file_digest(refused, 5119)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_only_deflate_is_unpacked(tmp_path, method):
+    """An archive packed by a method of which a kilobyte unpacks to gigabytes at one read is refused."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as packed:
+        packed.writestr("x.npy", member((3,)))
+    with pytest.raises(InputError, match=f"a.npz: 'x.npy' is packed by method {method}, expected deflate or none"):
+        read_arrays(tmp_path / "a.npz")
