@@ -180,7 +180,7 @@ def _play(
                     index = result.episode.index
                     if by_tick:
                         _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
-                        totals.furthest = max(totals.furthest, *states.differences[index][1:])
+                        totals.furthest = max([totals.furthest, *states.differences[index][1:]])
                     else:
                         _compare(audit, lines[index], result, seen.taken(index)[1])
                 for index, answers in seen.answers.items():
@@ -207,6 +207,8 @@ def _judge_answers(audit: Audit, record: EpisodeRecord, answers: Answers, totals
     elif answers.first is not None:
         differ = f"actions differ by up to {answers.largest:.3g}"
         audit.faults.append(f"{where}: at tick {answers.first} the policy decides otherwise; {differ}")
+    elif answers.unasked is not None:
+        audit.faults.append(f"{where}: no query of the policy gave the action at tick {answers.unasked}")
 
 
 def _key(one: EpisodeRecord | Episode) -> tuple[object, ...]:
@@ -286,6 +288,8 @@ def _compare_ticks(
     first, after = differences[0], differences[1:]
     if first > START:
         audit.faults.append(f"{where}: its first state is {first:.2g} m from that of its seed")
+    if len(differences) <= min(record.steps, result.steps):
+        audit.faults.append(f"{where}: states of its first {counted(len(after), 'tick')} alone are recorded")
     if (worst := max(after, default=0.0)) > tolerance:
         tick = after.index(worst)
         audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m from what {ENGINE} gives")

@@ -11,7 +11,7 @@ import torch
 
 from arena_newton.eval.folders.recordings import ActionRecorder
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.files.untrusted_files import read_arrays
+from arena_newton.files.untrusted_files import numbers, read_arrays
 from arena_newton.interfaces import Observation, Policy, World
 from arena_newton.physics.policy_view import PolicyView
 from arena_newton.rules import seeding
@@ -25,7 +25,7 @@ class RecordedQueries:
 
     actions: np.ndarray
     """Canonical actions, shape [ticks, 40]."""
-    queries: frozenset[int]
+    queries: frozenset[float]
     """Ticks; none of an episode of a version that did not keep them."""
 
     @classmethod
@@ -36,7 +36,8 @@ class RecordedQueries:
             InputError: It is absent or damaged.
         """
         arrays = read_arrays(path, ("action", "queries"))
-        return cls(arrays["action"], frozenset(np.ravel(arrays.get("queries", ())).astype(int).tolist()))
+        queries = numbers(arrays.get("queries", np.zeros(0)), f"{path}: queries", np.float64)
+        return cls(arrays["action"], frozenset(np.ravel(queries).tolist()))
 
 
 @dataclass
@@ -53,6 +54,10 @@ class Answers:
     """Message of the policy's first error."""
     first: int | None = None
     """First tick at which an action differs by more than the tolerance."""
+    until: int = 0
+    """Tick before which every action is of a query, or of the stand before the first."""
+    unasked: int | None = None
+    """First tick whose action no query gave."""
 
 
 class AskedAgain(ActionRecorder):
@@ -96,7 +101,7 @@ class AskedAgain(ActionRecorder):
             self.policy.attach(self._view)
         self._view.refresh()
         self._seeds[world] = seeding.policy_seed(episode.episode_seed)
-        self.answers[episode.index] = Answers()
+        self.answers[episode.index] = Answers(until=self.latency)
         self.policy.reset(self._seeds, [env.spec.gym_id] * env.worlds, np.arange(env.worlds) == world)
 
     def query(self, env: World, observation: Observation) -> None:
@@ -113,6 +118,10 @@ class AskedAgain(ActionRecorder):
             if self.policy is not None and self._view is not None:
                 self._view.refresh()
                 self._compare(env, self.policy, seen)
+        for world in np.flatnonzero(env.active & (env.tick >= 0)).tolist() if self.policy is not None else ():
+            found, tick = self.answers[self._episodes[world]], int(env.tick[world])
+            if found.until <= tick < len(self.recorded[self._episodes[world]].actions) and found.unasked is None:
+                found.unasked = tick
         super().before_physics(env, observation, action)
 
     def _compare(self, env: World, policy: Policy, seen: Observation) -> None:
@@ -125,6 +134,7 @@ class AskedAgain(ActionRecorder):
             if world in answer.errors:
                 found.error = found.error or answer.errors[world]
                 continue
+            found.until = max(found.until, begins + chunks.shape[1] if begins <= found.until else 0)
             recorded = self.recorded[index].actions[begins : begins + chunks.shape[1]]
             difference = np.abs(chunks[world, : len(recorded)] - recorded).max(axis=1, initial=0.0)
             found.asked += len(recorded)

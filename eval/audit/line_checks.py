@@ -166,6 +166,8 @@ def action_faults(run: RunRecord, records: Sequence[EpisodeRecord], lacking: lis
         path = f"{actions_folder(several, record.tracker)}/{name}"
         if (named := (record.media or {}).get("actions")) != path:
             yield f"{where}: its actions are {shown(named)}, expected {path}"
+            lacking.append(record.index)
+            continue
         try:
             data = read_regular(run.folder / path, MAX_ACTIONS_BYTES)
         except FileNotFoundError:

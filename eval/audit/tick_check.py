@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from arena_newton.data.recording.episode import EpisodeFile
+from arena_newton.errors import InputError
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
@@ -53,6 +54,8 @@ class StatesAgain(Recorder):
         model, file = env.scene.mj_model, EpisodeFile(self.files[episode.index])
         positions, last = file.array("arena_qpos", -1, model.nq), file.array("arena_final_qpos", model.nq)
         velocities = file.array("arena_qvel", len(positions), model.nv)
+        if not len(velocities):
+            raise InputError(f"{file.path}: arena_qvel holds no tick")
         self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities)
         self.differences[episode.index] = []
 
