@@ -15,6 +15,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.chain import head
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.eval.workers.shard_merge import merge
+from arena_newton.files.untrusted_files import array_digest
 from arena_newton.interfaces import Chunk
 from arena_newton.kernels import tick as codes
 from arena_newton.pictures.settings import CameraConfig
@@ -149,6 +150,25 @@ def test_another_policys_actions_are_found(honest, capsys):
     assert main([*asked, "--tolerance", "0.5"], factories(policy=Other)) == 0
 
 
+def rewritten(folder, lines, **arrays):
+    """Other arrays in the file of an episode's actions, with their hash."""
+    path = folder / lines[0]["media"]["actions"]
+    with np.load(path) as stored:
+        content = dict(stored) | arrays
+    np.savez_compressed(path, **content)
+    lines[0]["actions"] = array_digest(content)
+
+
+def test_hostile_actions_are_one_line(folder, capsys):
+    """A hash of actions without their file's path contradicts, and queries that are no numbers are code 2."""
+    forge(folder, lambda folder, lines: lines[0].update(media={}))
+    assert main(["audit", str(folder), "--all"], factories()) == 1
+    assert ": its actions are null, expected actions/" in capsys.readouterr().out
+    forge(folder, lambda folder, lines: rewritten(folder, lines[1:], queries=np.array(["x"])))
+    assert main(["audit", str(folder), "--all"], factories()) == 2
+    assert "queries holds <U1, expected numbers" in capsys.readouterr().err
+
+
 def test_a_rate_that_new_seeds_do_not_have_is_found(honest, capsys):
     """New episodes on seeds of the auditor: the claimed rate is confirmed, one that is far off contradicts."""
     fresh = ["audit", str(honest / "run"), "--policy", "stand", "--fresh", "100"]
@@ -200,7 +220,7 @@ class Seeing(FakePolicy):
 
 
 def test_pictures_are_drawn_again(parts, tmp_path, capsys):
-    """A replay draws with its stored camera what the policy was shown; a policy that was shown more is found."""
+    """A replay draws with its stored camera what the policy was shown; one shown more, or asked less, is found."""
     made = dataclasses.replace(
         parts, policy=lambda spec, **options: (policies.get if spec.startswith("replay") else Seeing)(spec, **options)
     )
@@ -209,6 +229,10 @@ def test_pictures_are_drawn_again(parts, tmp_path, capsys):
     assert main(["audit", str(tmp_path / "run"), "--all"], made) == 0
     assert main(["audit", str(tmp_path / "run"), "--all", "--policy", "stand"], made) == 0
     assert "level re-run" in capsys.readouterr().out
+    other = shutil.copytree(tmp_path / "run", tmp_path / "other")
+    forge(other, lambda folder, lines: rewritten(folder, lines, queries=np.zeros(1, np.int32)))
+    assert main(["audit", str(other), "--all", "--policy", "stand"], made) == 1
+    assert "no query of the policy gave the action at tick 4\n" in capsys.readouterr().out
     forge(tmp_path / "run", lambda folder, lines: shown_otherwise(folder))
     assert main(["audit", str(tmp_path / "run"), "--all"], made) == 1
     assert capsys.readouterr().out.count("shown is") == 2
@@ -241,3 +265,9 @@ def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
     assert main(["audit", str(run), "--all"], parts) == 1
     (found,) = (line for line in capsys.readouterr().out.splitlines() if "contradiction: " in line)
     assert "the state after tick 6 is 0.05 m from what mujoco gives" in found
+    for ticks, code in ((6, 1), (0, 2)):
+        few = {name: arrays[name][:ticks] for name in ("arena_qpos", "arena_qvel")}
+        np.savez_compressed(path, **arrays | few | {"arena_final_qpos": arrays["arena_qpos"][ticks]})
+        assert main(["audit", str(run), "--all"], parts) == code
+        said = "".join(capsys.readouterr())
+        assert f"states of its first {ticks} ticks alone" in said or "arena_qvel holds no tick" in said

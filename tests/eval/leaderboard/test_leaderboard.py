@@ -69,13 +69,13 @@ def build(entry, capsys, *flags):
     return code, said.out + said.err, site
 
 
-def repacked(entry, change):
+def repacked(entry, change, method=zipfile.ZIP_STORED):
     """Change the members of a bundle, and its hash in the entry, as a forger does who knows both."""
     path = entry / "bundle.zip"
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     change(members)
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", method) as archive:
         for name, data in members.items():
             archive.writestr(name, data)
     fill(entry, bundle=hashlib.sha256(path.read_bytes()).hexdigest())
@@ -172,6 +172,14 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         code, said, _ = build(entry, capsys)
         assert code == 2 and "is no file of a bundle" in said, said
         assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+def test_a_bundle_is_deflated_and_has_a_plain_name(entry, capsys):
+    """A bundle packed by another method than deflate, and an entry whose page would leave the site, are refused."""
+    repacked(entry, lambda members: members.update({"config.json": b" " * 50_000_000}), zipfile.ZIP_BZIP2)
+    code, said, _ = build(entry, capsys)
+    assert code == 2 and "is packed by method 12, expected deflate or none" in said, said
+    assert "letters, digits and _ . -" in build(entry / "..", capsys)[1]
 
 
 def test_a_bundle_may_be_elsewhere(entry, capsys):
