@@ -78,7 +78,7 @@ class JoinedFolders(ResultsFolder):
         """Remove files of episodes that no journal names: a process ended before it moved them."""
         for mode in list(self._by_mode)[1:]:
             for folder in SUBFOLDERS:
-                for path in self.path.glob(f"{folder}/*_{mode}_s*"):
+                for path in self.path.glob(f"{folder}/*_{mode}_*"):
                     path.unlink(missing_ok=True)
 
 

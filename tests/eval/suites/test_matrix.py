@@ -174,20 +174,25 @@ def test_a_kill_at_any_moment_loses_nothing(suite, played, tmp_path, monkeypatch
 
 
 def test_files_are_with_their_cells(suite, played, tmp_path, monkeypatch):
-    """Actions are in the folder of their own mode, and none is left elsewhere by Ctrl-C before its line was written."""
+    """Files are in the folder of their own mode, and none is left elsewhere by Ctrl-C before its line was written."""
 
     def actions(out):
         return {path.relative_to(out).as_posix() for path in out.glob("expert/twist2/boxing/**/*.npz")}
 
     def interrupt(written, to):
         assert written.is_file()
+        strips = written.parents[1] / "strips"
+        strips.mkdir()
+        for mode in ("base", "visual"):
+            (strips / f"boxing__{mode}__seed0__repeat0__ego.jpg").touch()  # as a run with --strip writes them first
         raise KeyboardInterrupt
 
     out, only = tmp_path / "out", ("--only", "task=boxing policy=expert")
     with monkeypatch.context() as patch:
         patch.setattr(joined_folders, "_move", interrupt)
         assert call(suite, out, *only) == 130
-    assert {path.split("/")[3] for path in actions(out)} == {"base"} and not list(out.rglob("*_visual_s*"))
+    assert {path.split("/")[3] for path in actions(out)} == {"base"} and not list(out.rglob("*_visual_*"))
+    assert len(list(out.rglob("*__base__*.jpg"))) == 1
     assert call(suite, out, *only) == 0
     assert actions(out) == actions(played) and len(actions(out)) == 8
 
