@@ -89,7 +89,7 @@ def _audit(
     checked: CheckedEntry, root: Path, replays: int, draw: int, factories: Factories | None
 ) -> Sequence[EvaluatedCell]:
     """Audit every run of an unpacked bundle; its cells."""
-    folders = runs_in(root)
+    folders, suite = runs_in(root), (root / SUITE_FILE).exists()
     for folder in folders:
         audit = audited(folder)
         if replays:
@@ -99,12 +99,15 @@ def _audit(
         checked.audits.append(audit)
         checked.faults += [fault.replace(f"{root}/", f"{checked.name}/") for fault in audit.faults]
         checked.notes += [note.replace(f"{root}/", f"{checked.name}/") for note in audit.notes]
+        if not (suite or audit.results["complete"]):  # failures may be what is left out; a suite's tables leave it out
+            number = f"{audit.results['finished']} of {audit.results['planned']} episodes"
+            checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: a run of {number}; rates are of whole plans")
     found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
     if found != (said := checked.entry.head):
         checked.faults.append(f"{checked.name}/{ENTRY_FILE}: head is {shown(said)}, its runs have {shown(found)}")
     if checked.faults:
         return []
-    cells = read_cells([root] if (root / SUITE_FILE).exists() else folders)
+    cells = read_cells([root] if suite else folders)
     checked.faults += cells.changed
     return [cell for cell in cells.cells if cell.latency == 0 and cell.records]
 

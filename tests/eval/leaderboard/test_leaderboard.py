@@ -139,6 +139,10 @@ def won(members):
     line |= {"outcome": "success", "reason": "success", "margin": 0.3, "progress": 1.0}
     line["predicates"] = {name: line["steps"] for name in line["predicates"]}
     line["events"] = [event for event in line["events"] if event["kind"] != "fall"]
+    relinked(members, lines)
+
+
+def relinked(members, lines):
     before, texts = b"", []
     for one in lines:
         before = json.dumps(one | {"previous": hashlib.sha256(before).hexdigest()}).encode() + b"\n"
@@ -146,17 +150,26 @@ def won(members):
     members["episodes.jsonl"] = b"".join(texts)
 
 
+def unfinished(members):
+    """Failures left out of a run that is said to be cancelled."""
+    lines = [json.loads(line) for line in members["episodes.jsonl"].splitlines()]
+    relinked(members, [line for line in lines if line["outcome"] == "success"])
+    content = json.loads(members["config.json"])
+    members["config.json"] = json.dumps(content | {"status": content["status"] | {"state": "cancelled"}}).encode()
+
+
 @pytest.mark.parametrize(
     ("edit", "named"),
     [
         (lambda entry: repacked(entry, won), "head is"),
+        (lambda entry: repacked(entry, unfinished), "of 16 episodes; rates are of whole plans"),
         (lambda entry: repacked(entry, lambda m: m.update({sorted(m)[0]: b"x" * 99})), "contradiction"),
         (lambda entry: (entry / "bundle.zip").write_bytes(b"other"), "SHA-256 is"),
         (lambda entry: fill(entry, trackers=["twist2"]), "trackers are twist2, its numbers have sonic twist2"),
         (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
         (lambda entry: fill(entry, numbers="paper", rows=["act"]), "numbers of paper are not those of its bundle"),
     ],
-    ids=["outcome", "actions", "bytes", "trackers", "weights", "numbers"],
+    ids=["outcome", "unfinished", "actions", "bytes", "trackers", "weights", "numbers"],
 )
 def test_an_edited_result_is_found(entry, edit, named, capsys):
     """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""
