@@ -116,6 +116,8 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         )
     if found.lacking:
         found.notes.append(f"{counted(len(found.lacking), 'episode')} cannot be replayed: the actions are not there.")
+    if unshown := sum(record.actions is not None and record.shown is None for record in run.records):
+        found.notes.append(f"{counted(unshown, 'episode')} without a hash of what the policy was shown: not compared.")
     if not found.results["complete"]:
         found.notes.append(f"Incomplete: {found.results['finished']} of {found.results['planned']} episodes.")
     return found

@@ -1,6 +1,7 @@
 """Audits accuse no honest folder, and find forgeries at the level at which they can be found."""
 
 import dataclasses
+import hashlib
 import json
 import shutil
 
@@ -204,6 +205,18 @@ def test_a_broken_link_is_named(folder, capsys, change, number):
     write_lines(folder, lines, link=False)
     code, found = audit(folder, capsys)
     assert code == 1 and any(f"line {number} is not linked to line {number - 1}: " in line for line in found), found
+
+
+def test_lines_of_an_older_form_are_marked(folder, capsys):
+    """A line said to be of the form before, which hashes neither pictures nor states, is noted."""
+
+    def older(folder, lines):
+        lines[0] |= {"schema": 3, "final_state": None, "shown": None}
+        lines[0]["actions"] = hashlib.sha256((folder / lines[0]["media"]["actions"]).read_bytes()).hexdigest()
+
+    forge(folder, older)
+    main(["audit", str(folder)])
+    assert "1 episode without a hash of what the policy was shown: not compared." in capsys.readouterr().out
 
 
 class Seeing(FakePolicy):
