@@ -53,6 +53,7 @@ _OPTIONAL = {
 }
 _EXTRA_PURPOSES = {
     "data": "datasets in LeRobot's format",
+    "docs": "the pages as a site (`docs/build.py`)",
     "gr00t": "`--policy remote:gr00t://`",
     "plots": "charts, and maps of predicted actions",
     "policies": "policies of the families diffusion, flow and pi05",

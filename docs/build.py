@@ -23,16 +23,16 @@ import api_reference
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 READING = {
-    "Start": "docs/index docs/scope docs/faq",
+    "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
     "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
         docs/design/identity""",
     "How-to": """docs/policies docs/serving docs/trackers docs/authoring docs/experts docs/recording docs/datasets
         docs/curation docs/training docs/suites docs/machines docs/comparing docs/sensitivity docs/auditing
-        docs/teleoperation docs/gym docs/motions docs/gradients docs/api examples/index""",
+        docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients docs/api examples/index""",
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
-    "Results": """docs/results/README docs/results/findings policies/weights/learned/card eval/tables/paper/README
-        docs/certificate docs/performance""",
+    "Results": """docs/results/README docs/results/findings docs/results/reproductions
+        policies/weights/learned/card eval/tables/paper/README docs/certificate docs/performance""",
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
 EXAMPLES = """first_episode own_policy own_tracker drive_by_code usd_variant record_and_build swap aim_a_kick
@@ -153,7 +153,7 @@ def build(out: Path) -> int:
     """Build the site.
 
     Args:
-        out: Folder of the site; what it holds is replaced.
+        out: Folder of the site; files of the same names are replaced.
 
     Returns:
         0, or 1 if Sphinx warned.

@@ -1,6 +1,6 @@
 """Command line of the benchmark: ``python -m arena_newton.eval [run|resume|merge|report|bench|certify|list] ...``.
 
-A command is its row here and its file in `eval/commands`, which loads when it is called.
+A command is its row here and its file in `eval/commands`, or the one that its row names; it loads when it is called.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ COMMANDS = {
     "record": CommandRow("record demonstrations for datasets, or more cameras with --from <out>"),
     "report": CommandRow("write tables and report again from the journal; one table of several runs", *RUNS),
     "audit": CommandRow("check results: lines, links, actions and tables of a folder against each other", *RUNS),
-    "bundle": CommandRow("make an entry of the leaderboard from a run", "<out>", RUNS[1]),
+    "bundle": CommandRow(
+        "make an entry of the leaderboard from a run", "<out>", RUNS[1], work="commands.leaderboard:bundle"
+    ),
     "leaderboard": CommandRow(
         "check the entries of the leaderboard and write its pages", "build [<entry> ...]", "what to do, build"
     ),
     "film": CommandRow("one success per task as a film or a picture", *RUNS),
     "tables": CommandRow("the paper's tables from suites and runs, next to the paper's numbers", *RUNS),
-    "reproductions": CommandRow("the paper's numbers, each next to ours, with the mark that intervals allow", *RUNS),
+    "reproductions": CommandRow(
+        "the paper's numbers, each next to ours with a mark", *RUNS, work="commands.tables:reproductions"
+    ),
     "compare": CommandRow("compare policies by their episodes: tests, intervals, who won which", *RUNS),
     "tsne": CommandRow(
         "map what one policy answers to the observations of two datasets", extras={"plots": (), "data": ("pyarrow",)}

@@ -1,14 +1,17 @@
-"""Gradients for torch: exact ones of kernels and of a ball's flight, estimated ones of the whole closed loop.
+"""Gradients for torch: exact ones of kernels, engine `mujoco` and a ball's flight, estimated ones of the closed loop.
 
 `docs/gradients.md` says what is exact, what is estimated and what has no gradient.
 """
 
 from arena_newton.differentiable.closed_loop import Differences, Played, central_differences, play
+from arena_newton.differentiable.engine_step import EngineState, EngineStep
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 
 __all__ = [
     "Differences",
+    "EngineState",
+    "EngineStep",
     "Played",
     "ReferenceState",
     "RollingBall",

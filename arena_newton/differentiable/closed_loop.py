@@ -1,7 +1,7 @@
 """Estimated gradients of the whole closed loop: tracker, contacts and rule included, by batched central differences.
 
-Contact-rich stepping has no adjoint. What has one number at its end can be played in twice as many worlds as it has
-parameters, all from one episode seed: the worlds then differ by what was moved and by nothing else.
+They ask nothing of engine, tracker or policy. What has one number at its end can be played in twice as many worlds as
+it has parameters, all from one episode seed: the worlds then differ by what was moved and by nothing else.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m arena_newton.eval tables`: the paper's tables from suites and results folders, written as files."""
+"""`python -m arena_newton.eval tables` and `reproductions`: the paper's tables and numbers next to ours, as files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from arena_newton.errors import InputError
 if TYPE_CHECKING:
     from arena_newton.eval.tables.evaluated_cells import CellSet
 
-__all__ = ["BEGIN", "END", "TablesOptions", "run"]
+__all__ = ["BEGIN", "END", "ReproductionsOptions", "TablesOptions", "reproductions", "run"]
 
 FORMATS = ("md", "tex", "csv", "png")
 """Forms in which tables are written."""
@@ -123,3 +123,35 @@ def _into_page(page: Path, table: str) -> list[str]:
         return []
     write_atomic(page, f"{before}{begin}\n\n{table}\n{end}{after}")
     return [page.name]
+
+
+@dataclass(frozen=True)
+class ReproductionsOptions:
+    """Print every success rate of the paper next to ours, with the mark that the interval of their difference allows.
+
+    Folders are suites, results folders, or files cells.csv of `eval tables`.
+    """
+
+    out: str | None = None
+    """Folder for reproductions.md; without it the page is printed alone."""
+
+
+def reproductions(folders: Sequence[Path], options: ReproductionsOptions) -> int:
+    """Print the page, and write it.
+
+    Raises:
+        InputError: A folder is unfit.
+        StorageError: The page cannot be written.
+    """
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.tables.evaluated_cells import read_cells
+    from arena_newton.eval.tables.reproduced_numbers import reproductions_page
+
+    cells = read_cells(folders)
+    if cells.changed:
+        raise InputError(f"reproductions: {' '.join(cells.changed)} No number of the paper can be compared with it")
+    text = reproductions_page(cells.cells)
+    print(text, end="")
+    if options.out is not None:
+        write_atomic(user_path(options.out) / "reproductions.md", text)
+    return 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import Audit, audited, runs_in
-from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, Entry, read_entry
+from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, BoardEntry, read_entry
 from arena_newton.eval.leaderboard.result_bundle import unpack
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import SUITE_FILE
@@ -36,10 +36,10 @@ class CheckedEntry:
 
     name: str
     """Name of its folder."""
-    entry: Entry
+    entry: BoardEntry
     rates: list[ConditionRate] = field(default_factory=list)
     audits: list[Audit] = field(default_factory=list)
-    """Of each run of its bundle."""
+    """Audits of the runs in its bundle."""
     faults: list[str] = field(default_factory=list)
     """Contradictions, a sentence each."""
     notes: list[str] = field(default_factory=list)
@@ -113,7 +113,7 @@ def _counts(rates: Sequence[ConditionRate]) -> set[tuple[object, ...]]:
     return {(*one.row, one.task, len(one.held or ()), sum((one.held or {}).values())) for one in rates}
 
 
-def _stated(folder: Path, entry: Entry) -> list[ConditionRate]:
+def _stated(folder: Path, entry: BoardEntry) -> list[ConditionRate]:
     """Numbers of an entry without runs: the paper's, published ones, or those of a `cells.csv`.
 
     Raises:

@@ -15,7 +15,7 @@ from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, loaded, read_regular
 from arena_newton.files.text import is_printable, plain_text
 
-__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "Entry", "read_entry"]
+__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "BoardEntry", "read_entry"]
 
 ENTRY_FILE = "entry.toml"
 BUNDLE_FILE = "bundle.zip"
@@ -28,7 +28,7 @@ Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v
 
 
 @dataclass(frozen=True)
-class Entry:
+class BoardEntry:
     """Statements of an entry about itself, a key of `entry.toml` each."""
 
     name: Name
@@ -67,7 +67,7 @@ class Entry:
         return self.numbers == "bundle"
 
 
-def read_entry(folder: Path) -> Entry:
+def read_entry(folder: Path) -> BoardEntry:
     """Read the entry of a folder.
 
     Raises:
@@ -81,11 +81,11 @@ def read_entry(folder: Path) -> Entry:
         raise InputError(f"{path}: no such file") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: not readable as TOML ({plain_text(error, 200)})") from None
-    known = [one.name for one in dataclasses.fields(Entry)]
+    known = [one.name for one in dataclasses.fields(BoardEntry)]
     for key in content:
         if key not in known:
             raise InputError(f"{path}: {plain_text(key, 60)} is not a key of an entry, known are {' '.join(known)}")
-    entry = loaded(str(path), content, Entry)
+    entry = loaded(str(path), content, BoardEntry)
     needed = {"trackers": True, "rows": not entry.own, "bundle": entry.own or entry.level != SELF_REPORTED}
     needed["checked"] = entry.level not in (SELF_REPORTED, CONSISTENT)
     for key, wanted in needed.items():

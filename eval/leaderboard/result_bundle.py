@@ -14,7 +14,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import CONSISTENT, audited, runs_in
 from arena_newton.eval.folders.results import RunRecord
-from arena_newton.eval.leaderboard.entry_file import Entry
+from arena_newton.eval.leaderboard.entry_file import BoardEntry
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
@@ -82,7 +82,7 @@ def made_bundle(folder: Path, actions: int, strips: int) -> tuple[bytes, str]:
         "bundle": hashlib.sha256(stream.getvalue()).hexdigest(),
         "head": joint_head([audit.results.get("head") for audit in audits]) or "",
     }
-    left = {one.name: "" for one in dataclasses.fields(Entry) if one.name not in ("numbers", "rows")}
+    left = {one.name: "" for one in dataclasses.fields(BoardEntry) if one.name not in ("numbers", "rows")}
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in (left | known).items()]
     return stream.getvalue(), "".join(lines)
 

@@ -168,7 +168,7 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
 
 
 def _facts(one: CheckedEntry) -> list[tuple[str, str]]:
-    """What an entry says of itself, and what its runs say, by name; nothing empty."""
+    """Facts that an entry and its runs say, by name; nothing empty."""
     entry, audits = one.entry, one.audits
     played = sum(audit.results["finished"] for audit in audits)
     again = sum(audit.replayed or 0 for audit in audits)

@@ -14,7 +14,7 @@ from arena_newton.files.text import counted
 from arena_newton.pages.tables import Table, escaped, percent
 from arena_newton.tasks.semantic_mode import semantic_notes, task_title
 
-__all__ = ["reproductions"]
+__all__ = ["reproductions_page"]
 
 MARKS = {"≈": "agree", "▲": "ours is higher", "▼": "ours is lower", "·": "not measured here"}
 """Sign between our rate and the paper's → its meaning."""
@@ -27,7 +27,7 @@ METHOD = (
 )
 
 
-def reproductions(cells: Sequence[EvaluatedCell]) -> str:
+def reproductions_page(cells: Sequence[EvaluatedCell]) -> str:
     """Page of every success rate in the paper's tables next to ours, as Markdown.
 
     Args:

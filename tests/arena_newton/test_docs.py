@@ -2,6 +2,8 @@
 
 import html
 import re
+import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -18,9 +20,11 @@ FOLDERS = "arena_newton eval policies trackers kernels usd_scenes tests benchmar
 
 
 def test_the_index_names_every_page():
-    """Every page of docs/ is linked from the index."""
+    """Every page of docs/ is linked from the index, and the site has it in its order of reading."""
     linked = set(re.findall(r"\]\(([\w./]+\.md)", (ROOT / "docs" / "index.md").read_text()))
     assert linked >= {str(page.relative_to(ROOT / "docs")) for page in DOCS} - {"index.md"}
+    ordered = set(re.findall(r"[\w/]+", (ROOT / "docs" / "build.py").read_text()))
+    assert ordered >= {str(page.relative_to(ROOT).with_suffix("")) for page in DOCS}
 
 
 def anchors(page: Path) -> set[str]:
@@ -102,3 +106,29 @@ def test_the_world_from_python():
     step, ball = world["plan"].grad[:, :2], world["where"].grad[:, world["judge"].ball]
     assert step.isfinite().all() and step.abs().max() > 0.0
     assert ball.isfinite().all() and ball.norm(dim=1).min() > 0.5
+
+
+TUTORIALS = (ROOT / "docs" / "tutorials.md").read_text().split("\n## ")[1:]
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("part", TUTORIALS, ids=lambda part: part.splitlines()[0])
+def test_a_tutorial_runs_as_it_stands(part, tmp_path, monkeypatch, capsys):
+    """Commands and programs of a tutorial run one after the other in an empty folder, and say what it says."""
+    monkeypatch.chdir(tmp_path)
+    for kind, block in re.findall(r"^```(\w+)\n(.*?)^```$", part, flags=re.DOTALL | re.MULTILINE):
+        if kind == "usda":
+            Path(re.search(r"Save this as `([\w.]+)`", part)[1]).write_text(block)
+        elif kind == "python":
+            exec(compile(block, "docs/tutorials.md", "exec"), {"__name__": "tutorial"})
+        else:
+            for line in block.splitlines():
+                python, minus, module, *flags = shlex.split(line)
+                assert (python, minus) == ("python", "-m")
+                monkeypatch.setattr(sys, "argv", [module, *flags])
+                with pytest.raises(SystemExit) as ended:
+                    runpy.run_module(module, run_name="__main__")
+                assert not ended.value.code, line
+    said = capsys.readouterr().out
+    for words in re.findall(r"`(timeout|reward/s|early end every)`", part):
+        assert words in said

@@ -234,12 +234,15 @@ def test_worlds_differ_by_their_actions_alone():
     env.close()
 
 
-def test_the_documented_estimate_runs():
-    """The block of docs/gradients.md gives two finite slopes: a step ahead and a lower stance change the margin."""
+def test_the_documented_programs_run():
+    """The blocks of docs/gradients.md give finite slopes: of a tick, and of a step ahead and a lower stance."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "gradients.md").read_text()
-    (block,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
+    tick, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
     world: dict = {"__name__": "docs_gradients"}
-    exec(compile(block, "docs/gradients.md", "exec"), world)
+    exec(compile(tick, "docs/gradients.md", "exec"), world)
+    for leaf in (world["targets"], world["factors"]):
+        assert leaf.grad.isfinite().all() and leaf.grad[0].abs().max() > 0.0
+    exec(compile(estimate, "docs/gradients.md", "exec"), world)
     found = world["found"]
     assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
     assert found.gradient[0] != 0.0

@@ -1,6 +1,7 @@
 """The package imports the same from a checkout and from a wheel, and shadows nobody."""
 
 import logging
+import re
 import subprocess
 import sys
 import tomllib
@@ -51,13 +52,14 @@ def test_public_names():
 
 
 def test_wheel_holds_one_top_level_package(tmp_path):
-    """The wheel installs `arena_newton` alone, with every floor and the scenes inside it."""
+    """The wheel installs `arena_newton` alone, with every floor and the scenes inside it, and a registry takes it."""
     import os
 
     from hatchling.builders.wheel import WheelBuilder
 
     os.environ["SOURCE_DATE_EPOCH"] = "315532800"
     wheel = next(WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"]))
+    assert Path(wheel).stat().st_size <= 95e6, "a registry takes 100 MB"
     names = zipfile.ZipFile(wheel).namelist()
     tops = {n.split("/", 1)[0] for n in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"arena_newton"}
@@ -86,12 +88,31 @@ def test_dependencies_have_both_ends_and_a_tested_version():
 
 
 def test_the_package_says_what_it_is():
-    """Types are offered to checkers, the citation names version and paper, and the console script is declared."""
+    """Types are offered to checkers, package and citation name one version, and the console script is declared."""
+    import arena_newton
+
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (ROOT / "arena_newton" / "py.typed").read_bytes() == b""
+    assert arena_newton.__version__ == project["version"]
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"version: {project['version']}" in citation and "2606.17833" in citation
     assert project["scripts"] == {"arena-newton": "arena_newton.__main__:main"}
+
+
+def test_the_container_is_pinned_and_has_no_root():
+    """The Dockerfile has known instructions, pins what it installs as the project does, and ends as a plain user."""
+    text = re.sub(r"^#.*\n", "", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE)
+    steps = [line.split(maxsplit=1) for line in text.replace("\\\n", " ").splitlines() if line]
+    assert {name for name, _ in steps} <= {"FROM", "RUN", "COPY", "USER", "WORKDIR", "ENTRYPOINT", "CMD"}
+    bases = [given.split()[0] for name, given in steps if name == "FROM"]
+    assert all(re.fullmatch(r"python:3\.12\.\d+-slim-\w+", base) for base in bases)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    tested = set(project["tool"]["uv"]["constraint-dependencies"])
+    installed = [word for name, given in steps if name == "RUN" for word in given.split() if "==" in word]
+    assert len(installed) == 3 and set(installed) <= tested
+    last = [name for name, _ in steps]
+    assert last.index("USER") > max(number for number, name in enumerate(last) if name == "RUN")
+    assert ["ENTRYPOINT", '["arena-newton"]'] in steps and "arena-newton" in project["project"]["scripts"]
 
 
 def test_a_missing_torchcodec_is_no_page_of_tracebacks():

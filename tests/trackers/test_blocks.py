@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+import warp as wp
 
 from arena_newton.errors import InputError
-from arena_newton.trackers.inference import blocks
+from arena_newton.trackers.inference import blocks, stored_graphs
 from arena_newton.trackers.inference.blocks import BlockRunner
 
 
@@ -111,3 +112,37 @@ def test_blocks_where_single_rows_have_other_bits():
     assert BlockRunner(network, 4, 7).plan() == (2, True)
     rows = torch.randn(7, 4)
     assert torch.equal(outputs(network, rows), rows)
+
+
+def test_an_exported_graph_is_stored(tmp_path, monkeypatch):
+    """A network is exported once, again if its stored graph is damaged or foreign, always if none can be stored."""
+    exports, export = [], torch.onnx.export
+    monkeypatch.setattr(torch.onnx, "export", lambda *given, **named: (exports.append(0), export(*given, **named)))
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    rows = torch.randn(8, 64, generator=torch.Generator().manual_seed(5))
+
+    def exported(network=None) -> int:
+        before = len(exports)
+        answer = blocks.compiled(network or mlp(64, 32, 8), (8, 64))(rows)
+        assert network is not None or torch.equal(answer, first)
+        return len(exports) - before
+
+    first = blocks.compiled(mlp(64, 32, 8), (8, 64))(rows)
+    assert exported() == 0
+    (file,) = (tmp_path / "onnx").iterdir()
+    graph = file.read_bytes()
+    other = mlp(64, 32, 8)
+    with torch.no_grad():
+        other[0].weight[0, 0] += 1e-6
+    assert exported(other) == 1
+    (foreign,) = set((tmp_path / "onnx").iterdir()) - {file}
+    for damage in (graph[:-1], graph[:200] + b"?" + graph[201:], b"", foreign.read_bytes()):
+        file.write_bytes(damage)
+        assert exported() == 1 and file.read_bytes() == graph and exported() == 0
+    for seed in range(stored_graphs.MOST):
+        torch.manual_seed(seed)
+        exported(torch.nn.Linear(64, 8))
+    assert len(list((tmp_path / "onnx").iterdir())) == stored_graphs.MOST and not file.exists()
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file"))
+    assert exported() == 1

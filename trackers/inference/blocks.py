@@ -13,6 +13,7 @@ divided among threads, each with a product of its own. On other devices the batc
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import itertools
@@ -28,6 +29,7 @@ import onnxruntime
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.trackers.inference.stored_graphs import graph_file, read_graph, write_graph
 
 __all__ = ["BlockRunner", "compiled"]
 
@@ -91,7 +93,7 @@ class OnnxProduct:
 
 
 def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-4, atol: float = 1e-5) -> OnnxProduct:
-    """The network in ONNX Runtime, on one thread of the CPU.
+    """The network in ONNX Runtime, on one thread of the CPU; its graph is stored in the kernel cache.
 
     Args:
         network: Maps a tensor to a tensor, rows first.
@@ -103,22 +105,39 @@ def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-
         InputError: It cannot be exported, or ONNX Runtime computes something else.
     """
     probe = torch.randn(shape, generator=torch.Generator().manual_seed(8))
-    file: Any = io.BytesIO()  # the exporter takes buffers, its types do not say so
-    try:
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            # The exporter is deprecated. Its successor (dynamo=True) gives the same bits, but takes 8 s instead of
-            # 0.3 s the first time in a process, 1.3 s instead of 0.05 s later, and fails to optimise `Symmetric`.
-            torch.onnx.export(
-                network.eval(), (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
-                dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
-            )  # fmt: skip
-            run = OnnxProduct(file.getvalue())
+    path = graph_file(network.eval(), shape)
+
+    def checked(graph: bytes) -> OnnxProduct:
+        run = OnnxProduct(graph)
+        with torch.no_grad():
             torch.testing.assert_close(run(probe), network(probe), rtol=rtol, atol=atol)
+        return run
+
+    if (known := read_graph(path)) is not None:
+        with contextlib.suppress(Exception):
+            return checked(known)
+    try:
+        graph = _exported_graph(network, probe)
+        run = checked(graph)
     except Exception as error:  # exporter and runtime raise classes of their own
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"the network cannot run in ONNX Runtime ({type(error).__name__}: {reason})") from error
+    write_graph(path, graph)
     return run
+
+
+def _exported_graph(network: torch.nn.Module, probe: torch.Tensor) -> bytes:
+    file: Any = io.BytesIO()  # the exporter takes buffers, its types do not say so
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        # The exporter is deprecated. Its successor (dynamo=True) gives the same bits, but takes 8 s instead of
+        # 0.3 s the first time in a process, 1.3 s instead of 0.05 s later, and fails to optimise `Symmetric`.
+        torch.onnx.export(
+            network, (probe,), file, dynamo=False, input_names=["obs"], output_names=["action"],
+            dynamic_axes={"obs": {0: "rows"}, "action": {0: "rows"}},
+        )  # fmt: skip
+    graph: bytes = file.getvalue()
+    return graph
 
 
 @dataclass

@@ -16,7 +16,6 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.files import limits, sandboxed_load
-from arena_newton.trackers.inference import onnx_mlp
 from arena_newton.trackers.inference.blocks import session_options
 
 __all__ = ["OnnxSession"]
@@ -36,6 +35,8 @@ class OnnxSession(torch.nn.Module):
         Raises:
             InputError: ONNX Runtime cannot run the file, or it has other widths.
         """
+        from arena_newton.trackers.inference import onnx_mlp  # ONNX, which trackers of safetensors do without
+
         super().__init__()
         where = f"{flag} {path}"
         self.path, self.in_width, self.out_width, self.twin = Path(path), in_width, out_width, None
@@ -77,6 +78,8 @@ class OnnxSession(torch.nn.Module):
         self.twin = None
         if device.type == "cpu":
             return
+        from arena_newton.trackers.inference import onnx_mlp
+
         with contextlib.suppress(InputError):
             self.twin = onnx_mlp.load(self.path, in_width=self.in_width, out_width=self.out_width)
 

@@ -1,6 +1,6 @@
 """Are gradients that are called exact those that differences estimate? Where both exist: conversion, margins, the ball.
 
-What has no exact gradient, a step of the engines, is not compared (`docs/gradients.md`).
+A tick of engine `mujoco` is compared in the tests, one of engine `warp` has no exact gradient (`docs/gradients.md`).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.leaderboard.entry_file import Entry
+from arena_newton.eval.leaderboard.entry_file import BoardEntry
 
 ROOT = Path(__file__).resolve().parents[3]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
@@ -120,7 +120,7 @@ def test_an_entry_without_a_key_or_file_is_refused(entry, capsys):
     """Each key without a default is asked for by name; files that are missing or no TOML are named."""
     path = entry / "entry.toml"
     text = path.read_text()
-    required = [one for one in Entry.__dataclass_fields__ if one not in ("numbers", "rows", *vars(Entry))]
+    required = [one for one in BoardEntry.__dataclass_fields__ if one not in ("numbers", "rows", *vars(BoardEntry))]
     for key in required:
         path.write_text(re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE))
         code, said, _ = build(entry, capsys)
@@ -154,8 +154,9 @@ def won(members):
         (lambda entry: (entry / "bundle.zip").write_bytes(b"other"), "SHA-256 is"),
         (lambda entry: fill(entry, trackers=["twist2"]), "trackers are twist2, its numbers have sonic twist2"),
         (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
+        (lambda entry: fill(entry, numbers="paper", rows=["act"]), "numbers of paper are not those of its bundle"),
     ],
-    ids=["outcome", "actions", "bytes", "trackers", "weights"],
+    ids=["outcome", "actions", "bytes", "trackers", "weights", "numbers"],
 )
 def test_an_edited_result_is_found(entry, edit, named, capsys):
     """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""
@@ -171,6 +172,15 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         code, said, _ = build(entry, capsys)
         assert code == 2 and "is no file of a bundle" in said, said
         assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+def test_a_bundle_may_be_elsewhere(entry, capsys):
+    """An entry with numbers of a table and the hash of a bundle that is not there is listed, and says so."""
+    fill(entry, numbers="paper", rows=["act"])
+    (entry / "bundle.zip").unlink()
+    code, said, site = build(entry, capsys)
+    assert code == 0 and "is not part of this board" in said
+    assert "is not part of this board" in (site / "ours.html").read_text()
 
 
 def test_text_of_an_entry_stays_text(entry, capsys):

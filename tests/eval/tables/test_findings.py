@@ -177,6 +177,18 @@ def test_pages_of_results_are_those_of_their_records(tmp_path, monkeypatch):
     assert text.count(BEGIN) == text.count(END) == 1 and semantic_note() in text
 
 
+def test_marks_of_reproductions_follow_from_both_rates():
+    """Each mark is the sign of the interval of Agresti and Caffo (2000) over 60 episodes of each, or none."""
+    text = (RESULTS / "reproductions.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith(("| in-GMT", "| cross-GMT"))]
+    found = re.findall(r"(\d+\.\d) ([≈▲▼]) (\d+\.\d)", "".join(rows))
+    assert len(found) > 90 and {mark for _, mark, _ in found} == set("≈▲▼")
+    for ours, mark, theirs in found:
+        a, b = ((round(float(rate) * 0.6) + 1) / 62 for rate in (ours, theirs))
+        wide = 1.96 * (a * (1 - a) / 62 + b * (1 - b) / 62) ** 0.5
+        assert mark == ("≈" if abs(a - b) <= wide else "▲" if a > b else "▼"), (ours, mark, theirs)
+
+
 def ends(both=0, only_first=0, only_second=0, neither=0):
     """Outcomes of two conditions over the same episodes, from counts."""
     kinds = [(True, True)] * both + [(True, False)] * only_first + [(False, True)] * only_second

@@ -1,0 +1,293 @@
+"""Adjoint of a tick of native MuJoCo in one world, by the implicit function theorem where its solver stopped.
+
+The solver leaves an acceleration a at which inverse dynamics F(q, v, a), explicit in its arguments, equals the drives'
+torque. That equation is differentiated instead of the solver's iterations: forward is `mj_step` itself, backward solves
+once with dF/da, the Hessian of the solver's cost. The integrator adds (M - h D)(v' - v) = h M a with a constant D, and
+q' = q + h v' on the manifold. Gradients of positions are tangent, of length nv, where a name does not say qpos.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from arena_newton.errors import InputError
+from arena_newton.physics.scene import Scene
+
+__all__ = ["ImplicitWorld", "Inputs", "check", "scaled"]
+
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_STEP = 1e-7
+"""Step of the differences of inverse dynamics [m, rad, and per s and s²]: a contact stiffens within 1 mm."""
+_FACTOR_STEP = 1e-6
+"""Step of the differences of inverse dynamics in a factor of the model."""
+_AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+                  [[0, 0, -1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+                  [[0, 0, 0, -1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]]], dtype=np.float64)  # fmt: skip
+"""`_AXES[i] @ quat` is quat times the i-th imaginary unit, twice its change per angle about body axis i."""
+
+Scaled = list[tuple[str, list[int] | tuple[list[int], int]]]
+"""Fields of a MuJoCo model, and the index of the numbers in each, that one parameter scales."""
+
+
+def check(m: mujoco.MjModel) -> None:
+    """Refuse a model of which a part has no gradient here.
+
+    Raises:
+        InputError: It names the first such part.
+    """
+    drives = [
+        m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT,
+        m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED,
+        m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
+        m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE,
+        m.actuator_gear[:, 0] == 1.0,
+        ~(m.actuator_forcelimited | m.actuator_ctrllimited).astype(bool),
+        np.isin(m.jnt_type[m.actuator_trnid[:, 0]], (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)),
+    ]
+    foreign = ~np.logical_and.reduce(drives)
+    parts = {
+        "an integrator other than implicitfast": m.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        "a tendon": m.ntendon > 0,
+        "an activation state": m.na > 0,
+        f"actuator {int(foreign.argmax())}, not a joint's position drive": foreign.any(),
+        "a delayed actuator": m.nhistory > 0,
+        "a deformable body": m.nflex > 0,
+        "a plugin": m.nplugin > 0,
+        "a fluid": m.opt.density > 0.0 or m.opt.viscosity > 0.0,
+        "nonlinear damping": m.dof_dampingpoly.any() or m.actuator_damping.any(),
+        "gravity compensation by a drive": m.jnt_actgravcomp.any(),
+        "a solver without slip": m.opt.noslip_iterations > 0,
+    }
+    for part, there in parts.items():
+        if there:
+            raise InputError(f"engine mujoco has no gradient here: its model has {part}")
+
+
+def scaled(name: str, scene: Scene) -> Scaled:
+    """Numbers of the scene's model that a parameter scales: `mass`, `friction`, `kp` or `kd`, or `mass:PRIM` and so on.
+
+    Raises:
+        InputError: Another name, or a prim without bodies, geoms or driven joints.
+    """
+    kind, _, prim = name.partition(":")
+    m = scene.mj_model
+
+    def under(paths: dict[str, int]) -> list[int]:
+        return [index for path, index in paths.items() if not prim or path == prim or path.startswith(f"{prim}/")]
+
+    if kind == "mass":
+        rows = under(scene.body_ids)
+        found: Scaled = [("body_mass", rows), ("body_inertia", rows)]
+    elif kind == "friction":
+        rows = scene.geom_ids(prim) if prim else list(range(m.ngeom))
+        found = [("geom_friction", (rows, 0))]
+    elif kind in ("kp", "kd"):
+        rows = np.flatnonzero(np.isin(m.actuator_trnid[:, 0], under(scene.joint_ids))).tolist()
+        found = [("actuator_biasprm", (rows, 1 if kind == "kp" else 2))]
+        found += [("actuator_gainprm", (rows, 0))] if kind == "kp" else []
+    else:
+        raise InputError(f"parameter {name}: must begin with mass, friction, kp or kd")
+    if not rows:
+        raise InputError(f"parameter {name}: {scene.path} has nothing of the kind at or under the prim")
+    return found
+
+
+class Inputs(NamedTuple):
+    """Arguments of a tick of one world, or a number's gradient to them."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    carried: np.ndarray
+    """All else of the state (`mjSTATE_INTEGRATION`); it has no gradient."""
+    targets: np.ndarray
+    """Targets of the drives [rad]."""
+    factors: np.ndarray
+    """Factors of the model, one per parameter."""
+
+
+class _Substep(NamedTuple):
+    """A step of the engine: position and velocity before it, acceleration, and the change of velocity."""
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    change: np.ndarray
+
+
+class ImplicitWorld:
+    """One world: its ticks as the engine makes them, and their adjoint."""
+
+    def __init__(self, model: mujoco.MjModel, scene: Scene, substeps: int, parameters: Sequence[Scaled]):
+        """Copy a model, which `check` admits; `parameters` are the factors that every tick takes."""
+        self._origin, self._latch, self._substeps, self._parameters = model, scene.latch, substeps, parameters
+        self._fields = {field for parameter in parameters for field, _ in parameter}
+        self._model, self._inverse = copy.copy(model), copy.copy(model)
+        self._inverse.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # saves a third of inverse dynamics
+        self._data = mujoco.MjData(model)
+        joints = model.actuator_trnid[:, 0]
+        self._dof, self._qadr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
+        bound = np.tile((-np.inf, np.inf), (model.nv, 1))
+        limited = np.flatnonzero(model.jnt_actfrclimited)
+        bound[model.jnt_dofadr[limited]] = model.jnt_actfrcrange[limited]
+        self._low, self._high = bound.T
+        turning = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+        self._quats = [
+            (int(model.jnt_qposadr[j]) + turning[kind], int(model.jnt_dofadr[j]) + turning[kind])
+            for j, kind in enumerate(model.jnt_type.tolist())
+            if kind in turning
+        ]
+        self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
+        self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
+        self._mass_at = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
+        self._off_diagonal = self._mass_at[0] != self._mass_at[1]
+
+    def read(self, state: np.ndarray, locked: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The state of a running physics as a tick takes it: qpos, qvel and all else.
+
+        Raises:
+            InputError: A force acts from outside, whose arm has no gradient here.
+        """
+        d = self._data
+        mujoco.mj_setState(self._origin, d, state, _STATE)
+        if d.xfrc_applied.any():
+            raise InputError("engine mujoco has no gradient here: an external force acts on a body")
+        if self._latch is not None:
+            d.eq_active[self._latch.equality] = locked
+        return self._read()
+
+    def tick(self, given: Inputs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The engine's tick: qpos, qvel and all else after it."""
+        d, latch = self._data, self._latch
+        self._begin(given)
+        mujoco.mj_step(self._model, d, self._substeps)
+        if latch is not None and np.float32(d.qpos[latch.handle_qpos]) <= latch.release_angle:
+            d.eq_active[latch.equality] = 0
+        return self._read()
+
+    def adjoint(self, given: Inputs, qpos: np.ndarray, qvel: np.ndarray) -> Inputs:
+        """Gradient of a number to what a tick took, from its gradients to qpos and qvel after the tick."""
+        d, steps = self._data, []
+        self._begin(given)
+        for _ in range(self._substeps):
+            q, v = d.qpos.copy(), d.qvel.copy()
+            mujoco.mj_step(self._model, d)
+            steps.append(_Substep(q, v, d.qacc.copy(), d.qvel - v))
+        self._scale(self._inverse, given.factors)
+        at_q, at_v, at_targets = self._tangent(d.qpos, qpos), qvel, np.zeros_like(given.targets)
+        weighed: list[tuple[_Substep, np.ndarray, np.ndarray]] = []
+        for step in reversed(steps):
+            at_q, at_v, at_drives, *weights = self._step_adjoint(step, given.targets, at_q, at_v)
+            at_targets += at_drives
+            weighed.append((step, weights[0], weights[1]))
+        moved = given.factors + _FACTOR_STEP * np.eye(len(given.factors))
+        base = self._residuals(weighed, given.targets, given.factors) if self._parameters else 0.0
+        slopes = [(self._residuals(weighed, given.targets, factors) - base) / _FACTOR_STEP for factors in moved]
+        at_factors = np.array(slopes, dtype=np.float64)
+        return Inputs(self._ambient(given.qpos, at_q), at_v, np.zeros_like(given.carried), at_targets, at_factors)
+
+    def _begin(self, given: Inputs) -> None:
+        d = self._data
+        self._scale(self._model, given.factors)
+        mujoco.mj_setState(self._model, d, given.carried, _STATE)
+        d.qpos[:], d.qvel[:], d.ctrl[:] = given.qpos, given.qvel, given.targets
+
+    def _read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        carried = np.empty(mujoco.mj_stateSize(self._origin, _STATE))
+        mujoco.mj_getState(self._origin, self._data, carried, _STATE)
+        return self._data.qpos.copy(), self._data.qvel.copy(), carried
+
+    def _scale(self, model: mujoco.MjModel, factors: np.ndarray) -> None:
+        for field in self._fields:
+            getattr(model, field)[:] = getattr(self._origin, field)
+        for parameter, factor in zip(self._parameters, factors, strict=True):
+            for field, index in parameter:
+                getattr(model, field)[index] *= factor
+        if "body_mass" in self._fields:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def _damping(self, model: mujoco.MjModel) -> np.ndarray:
+        """Diagonal of the integrator's D; the engine keeps a drive's part where its torque is at the limit."""
+        found: np.ndarray = np.bincount(self._dof, model.actuator_biasprm[:, 2], model.nv) - model.dof_damping
+        return found
+
+    def _torque(self, model: mujoco.MjModel, step: _Substep, targets: np.ndarray) -> np.ndarray:
+        """Torque of the drives before their limits, shape [nv]."""
+        bias = model.actuator_biasprm
+        force = model.actuator_gainprm[:, 0] * targets + bias[:, 0]
+        force = force + bias[:, 1] * step.q[self._qadr] + bias[:, 2] * step.v[self._dof]
+        torque: np.ndarray = np.bincount(self._dof, force, model.nv)
+        return torque
+
+    def _mass_matrix(self) -> np.ndarray:
+        rows, columns = self._mass_at
+        full = np.zeros((self._model.nv, self._model.nv))
+        full[rows, columns] = full[columns, rows] = self._data.M
+        return full
+
+    def _step_adjoint(
+        self, step: _Substep, targets: np.ndarray, at_q: np.ndarray, at_v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Gradients to position, velocity and targets before a step, and the weights of its two equations."""
+        m, d = self._inverse, self._data
+        h, nv = m.opt.timestep, m.nv
+        at_v, at_q = at_v + h * at_q, at_q.copy()
+        for _, dof in self._quats:
+            part = slice(dof, dof + 3)
+            by_quat, by_vel = np.empty(9), np.empty(9)
+            mujoco.mjd_quatIntegrate(step.v[part] + step.change[part], h, by_quat, by_vel, np.empty(3))
+            at_v[part] += h * (by_vel.reshape(3, 3).T @ at_q[part] - at_q[part])
+            at_q[part] = by_quat.reshape(3, 3).T @ at_q[part]
+        d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
+        by_q, by_v, by_a, mass_by_q = (np.empty((nv, width)) for width in (nv, nv, nv, m.nC))
+        mujoco.mjd_inverseFD(m, d, _STEP, False, by_q, by_v, by_a, None, None, None, mass_by_q)  # rows are inputs
+        mass = self._mass_matrix()
+        y = h * np.linalg.solve(mass - h * np.diag(self._damping(m)), at_v)
+        w = np.linalg.solve(by_a, mass @ y)
+        torque = self._torque(m, step, targets)
+        driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
+        rows, columns = self._mass_at
+        rest = step.a - step.change / h
+        pairs = y[rows] * rest[columns] + np.where(self._off_diagonal, y[columns] * rest[rows], 0.0)
+        at_q = at_q + mass_by_q @ pairs - by_q @ w
+        at_v = at_v - by_v @ w
+        gain, bias, drive = m.actuator_gainprm, m.actuator_biasprm, driven[self._dof]
+        at_q += np.bincount(self._dof, bias[:, 1] * drive, nv)
+        at_v += np.bincount(self._dof, bias[:, 2] * drive, nv)
+        return at_q, at_v, gain[:, 0] * drive, y, w
+
+    def _residuals(
+        self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], targets: np.ndarray, factors: np.ndarray
+    ) -> float:
+        """Weighted sum of what integrator and solver equate to 0, whose slope in a factor is the number's."""
+        m, d = self._inverse, self._data
+        self._scale(m, factors)
+        total = 0.0
+        for step, y, w in weighed:
+            d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
+            mujoco.mj_inverse(m, d)
+            torque = np.clip(self._torque(m, step, targets), self._low, self._high)
+            inertial = self._mass_matrix() @ (step.a - step.change / m.opt.timestep) + self._damping(m) * step.change
+            total += float(y @ inertial + w @ (torque - d.qfrc_inverse))
+        return total
+
+    def _tangent(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Tangent gradient from one in the coordinates of qpos."""
+        found = np.empty(self._model.nv)
+        found[self._line_v] = gradient[self._line_q]
+        for q, v in self._quats:
+            found[v : v + 3] = 0.5 * (_AXES @ qpos[q : q + 4]) @ gradient[q : q + 4]
+        return found
+
+    def _ambient(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Gradient in the coordinates of qpos, tangent to its unit quaternions."""
+        found = np.empty(self._model.nq)
+        found[self._line_q] = gradient[self._line_v]
+        for q, v in self._quats:
+            quat = qpos[q : q + 4]
+            found[q : q + 4] = 2.0 * gradient[v : v + 3] @ (_AXES @ quat) / (quat @ quat)
+        return found
