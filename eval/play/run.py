@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 import warp as wp
@@ -22,7 +22,6 @@ import warp as wp
 from arena_newton import policies, trackers
 from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.cli.quiet import quiet_warp
-from arena_newton.data.recording.demonstration import DemonstrationRecorder
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.recordings import ActionRecorder
@@ -31,7 +30,6 @@ from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play import recording
 from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
@@ -53,7 +51,6 @@ from arena_newton.eval.reports.progress import kernels_to_compile
 from arena_newton.files.own_files import file_label
 from arena_newton.files.text import counted, plain_text
 from arena_newton.interfaces import EpisodeResult, Recorder, World
-from arena_newton.pictures.recorder import EpisodeRecorder
 from arena_newton.pictures.viewing import FailureRecorder, WorldViewer
 from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.label_reader import read_by
@@ -62,6 +59,10 @@ from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from arena_newton.trackers.base import Tracker
 from arena_newton.usd_scenes import validate
+
+if TYPE_CHECKING:
+    from arena_newton.data.recording.demonstration import DemonstrationRecorder
+    from arena_newton.pictures.recorder import EpisodeRecorder
 
 __all__ = [
     "Factories",
@@ -313,7 +314,11 @@ class RunPlayer:
             if self.viewer is not None:
                 self.viewer.open(env, group)
                 recorders.append(self.viewer)
-            noise = recording.disturbance_of(config, task, episodes[0].max_steps)
+            noise = None
+            if flags.disturb or config.recording is not None:
+                from arena_newton.eval.play import recording  # its codecs, for which other runs do not wait
+
+                noise = recording.disturbance_of(config, task, episodes[0].max_steps)
             recorders += [] if noise is None else [noise]
             if config.recording is not None:
                 described = recording.facts_of(config, task, tracker, mode, facts, self.folder.installed)
@@ -408,6 +413,8 @@ def _recorder(config: RunConfig, folder: Path, tracker: str) -> EpisodeRecorder 
     flags = config.flags
     if not (flags.video or flags.strip):
         return None
+    from arena_newton.pictures.recorder import EpisodeRecorder
+
     kinds = {"video": flags.video, "strip": flags.strip, "follow": flags.follow}
     prefix = _prefix(flags, tracker)
     return EpisodeRecorder(folder, **kinds, episodes=flags.video_episodes, size=config.video_size, prefix=prefix)

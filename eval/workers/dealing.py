@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -36,7 +37,7 @@ from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecor
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.messages import ActionFile, Built, Done, Ended, Event, Opened, Ticks
 from arena_newton.eval.workers.worker_pool import Assignment, Job, Lost, Worker, WorkerPool, backend_of
-from arena_newton.files.text import plain_text
+from arena_newton.files.text import counted, plain_text
 from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
@@ -73,6 +74,9 @@ def execute(folders: Sequence[ResultsFolder], factories: Factories | None = None
     with backend_of(first.flags, first.device) as backend, contextlib.ExitStack() as ended:
         pool = WorkerPool(backend, max(len(folder.config.episodes) for folder in folders), factories)
         ended.callback(pool.dismiss)
+        planned = counted(sum(len(folder.config.episodes) for folder in folders), "episode")
+        said = f"  loading tracker and policy for {planned}; processes: {len(pool.workers)}"
+        print(said, file=sys.stderr, flush=True)
         for folder in folders:
             began = time.perf_counter()
             if not _played(pool, folder):

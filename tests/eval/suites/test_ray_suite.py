@@ -196,7 +196,7 @@ def test_a_process_stays_in_its_scene(inline, suite, tmp_path):
     assert cells == [name.format(task) for task in ("boxing", "football") for name in order]
 
 
-@pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
+@pytest.mark.parametrize(("every", "by"), [(11, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)
@@ -229,13 +229,20 @@ def test_interrupted_and_continued(inline, suite, alone, tmp_path, capsys):
     assert {document["status"]["state"] for document in documents} == {"success"} and len(documents) == 6
 
 
-def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch):
-    """Experts and the policy that sees are played by the same two processes, into the folder of each."""
+def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch, capsys):
+    """Experts and the policy that sees are played by the same two processes; a line says so before they load."""
+    said, opened = [], dealing.WorkerPool.opened
+    monkeypatch.setattr(
+        dealing.WorkerPool, "opened", lambda *given: (said.append(capsys.readouterr().err), opened(*given))[1]
+    )
     monkeypatch.setattr(run, "_recorder", lambda *_: None)  # these worlds have nothing to draw
     fake, out = inline(), tmp_path / "out"
     assert main(["--device", "cpu", "--jobs", "2", "--out", str(out)], factories()) == 0
     assert fake.actors == 2 and {folder for _, folder in fake.opened} == {str(out), str(out / "learned")}
-    for folder in (out, out / "learned"):
+    folders = out, out / "learned"
+    episodes = sum(len((folder / "episodes.jsonl").read_text().splitlines()) for folder in folders)
+    assert said[0].endswith(f"  loading tracker and policy for {episodes} episodes; processes: 2\n")
+    for folder in folders:
         assert json.loads((folder / "results.json").read_text())["complete"]
 
 
