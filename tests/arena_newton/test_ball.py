@@ -154,7 +154,7 @@ def test_the_ball_rests_rolls_and_slides_alike_on_both_engines(drops):
     starts[1, 3] = -0.9 / RADIUS
     physics, q, v = thrown(drops, 0.1, 0.005, 0.0, np.repeat(starts, drops[1].worlds // 3, axis=0))
     top = 0.0
-    for _ in range(80):
+    for _ in range(50):
         physics.step()
         top = np.maximum(top, physics.qpos.numpy()[:, q + 2] - RADIUS)
     height, speed = physics.qpos.numpy()[:, q + 2] - RADIUS, physics.qvel.numpy()[:, v + 1]
@@ -162,7 +162,7 @@ def test_the_ball_rests_rolls_and_slides_alike_on_both_engines(drops):
     assert (height > -3e-4).all() and (height < SKIN_HEIGHT + 3e-4).all() and (top < 5e-3).all()
     assert speed[resting] == pytest.approx(0.0, abs=0.01)
     assert speed[rolling] == pytest.approx(0.9, abs=0.01)
-    assert speed[sliding] == pytest.approx(3.0 * 5 / 7, abs=0.1)
+    assert speed[sliding] == pytest.approx(3.0 * 5 / 7, abs=0.25), "without friction it would keep 3 m/s"
 
 
 def test_scene_keeps_the_rule_sets_restitution():

@@ -80,6 +80,7 @@ def test_many_rows_are_divided_among_threads(monkeypatch, worlds):
 
 def test_a_module_that_cannot_be_compiled_is_refused(monkeypatch):
     """A failing exporter or runtime ends the first tick in one line."""
+    monkeypatch.setattr(blocks, "graph_file", lambda network, shape: None)
     monkeypatch.setattr(torch.onnx, "export", lambda *a, **k: 1 / 0)
     with pytest.raises(InputError, match=r"cannot run in ONNX Runtime \(ZeroDivisionError: division by zero\)"):
         outputs(mlp(451, 64, 29), torch.randn(20, 451))

@@ -196,7 +196,7 @@ def test_a_process_stays_in_its_scene(inline, suite, tmp_path):
     assert cells == [name.format(task) for task in ("boxing", "football") for name in order]
 
 
-@pytest.mark.parametrize(("every", "by"), [(5, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
+@pytest.mark.parametrize(("every", "by"), [(11, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
 def test_losses_lose_nothing(inline, suite, alone, tmp_path, every, by):
     """Processes die while they begin, open a cell and play; every episode is in its journal once, with its outcome."""
     count = itertools.count(1)
