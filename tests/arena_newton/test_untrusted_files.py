@@ -83,7 +83,7 @@ def test_damaged_members_are_one_line(tmp_path, damage):
 def test_many_members(tmp_path):
     """An archive of more members than any of ours is refused."""
     path = archive(tmp_path / "a.npz", **{f"x{n}": member((0,)) for n in range(limits.ARCHIVE_MEMBERS + 1)})
-    with pytest.raises(InputError, match="holds 1001 members, expected at most 1000"):
+    with pytest.raises(InputError, match="holds 1,001 members, expected at most 1,000"):
         read_arrays(path, ())
 
 
