@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +28,8 @@ class AuditOptions:
     """Head that was published with the numbers of the one folder; the journal must have it."""
     replay: int = 0
     """Play so many episodes again on engine mujoco, from their actions alone: they must end as recorded, to the bit."""
-    draw: int = 0
-    """Number of your own by which, with the head, they are drawn."""
+    draw: int | None = None
+    """Number of your own by which, with the head, they are drawn; without one a random one, which is printed."""
     all: bool = False
     """Play all episodes again."""
     policy: str | None = None
@@ -72,6 +73,9 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         raise InputError("--fresh and --tolerance: are of a --policy; name it")
     if options.head is not None and len(named) > 1:
         raise InputError("--head: is of one folder")
+    draw = secrets.randbelow(1 << 31) if options.draw is None else options.draw
+    if options.draw is None and (options.replay or options.fresh):
+        print(f"--draw {draw}: drawn at random, for the owner of the results cannot know it", flush=True)
     audits = []
     for folder in named:
         one = audited(folder, options.head)
@@ -79,12 +83,12 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
             from arena_newton.eval.audit.action_replay import drawn, replay
 
             asked = {name: getattr(options, name) for name in ("policy", "tolerance", "tick_tolerance")}
-            chosen = drawn(one, None if options.all else options.replay, options.draw)
+            chosen = drawn(one, None if options.all else options.replay, draw)
             replay(one, chosen, factories, **asked)
         if options.fresh and options.policy is not None:
             from arena_newton.eval.audit.fresh_episodes import play_fresh
 
-            play_fresh(one, options.policy, options.fresh, options.draw, factories)
+            play_fresh(one, options.policy, options.fresh, draw, factories)
         audits.append(one)
         print(f"{folder}: {', '.join(f'{name} {value}' for name, value in one.facts())}")
         for fault in one.faults:

@@ -27,8 +27,8 @@ class LeaderboardOptions:
     """Folder of the site; its first page is index.html."""
     replay: int = 0
     """Play so many episodes of each run again, of those whose actions are in its bundle."""
-    draw: int = 0
-    """Number of your own by which, with the head, they are drawn."""
+    draw: int | None = None
+    """Number of your own by which, with the head, they are drawn; --replay asks for one."""
 
 
 def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factories | None = None) -> int:
@@ -63,12 +63,14 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
             raise InputError(f"leaderboard: {entry}: a page is named by its entry's folder: letters, digits and _ . -")
     if len({entry.name for entry in entries} | {"index"}) <= len(entries):
         raise InputError(f"leaderboard: two entries of one name, or one named index: {' '.join(map(str, entries))}")
+    if options.replay and options.draw is None:
+        raise InputError("--replay: draws episodes by a number that nobody could know; give one by --draw")
     out = user_path(options.out)
     with tempfile.TemporaryDirectory() as scratch:
         found = []
         for folder in entries:
             into = Path(scratch) / folder.name
-            one = check_entry(folder, into, replays=options.replay, draw=options.draw, factories=factories)
+            one = check_entry(folder, into, replays=options.replay, draw=options.draw or 0, factories=factories)
             found.append(one)
             print(f"{folder}: {one.entry.level}, {counted(len(one.rates), 'rate')}")
             for fault in one.faults:

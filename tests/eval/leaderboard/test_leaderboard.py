@@ -83,6 +83,8 @@ def repacked(entry, change, method=zipfile.ZIP_STORED):
 
 def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
     """Bundle, build and page: rates, replays and the bundle are shown, all links are there; no entry is replaced."""
+    assert main(["leaderboard", "build", str(entry), "--replay", "2"], factories()) == 2
+    assert "give one by --draw" in capsys.readouterr().err
     code, said, site = build(entry, capsys, "--replay", "2", "--draw", "7")
     assert code == 0 and "consistent, 4 rates" in said, said
     text = (site / "ours.html").read_text()
