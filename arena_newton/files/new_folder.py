@@ -46,6 +46,8 @@ def held(path: Path, taken: str = "", *, shared: bool = False, wait: bool = Fals
         except OSError:  # some network disks have no locks
             if not folder:
                 raise
+        if not os.fstat(file).st_nlink:  # who held it removed it after this one opened it
+            raise InputError(taken)
         yield file
     finally:
         os.close(file)

@@ -58,6 +58,14 @@ def test_a_held_file_is_shared_or_waited_for(tmp_path):
         assert waiting.result(20.0) >= 0
 
 
+def test_a_file_that_was_removed_meanwhile_is_not_held(tmp_path, monkeypatch):
+    """A lock that its holder removed between opening and locking holds nothing, and is refused."""
+    path, real = tmp_path / "lock", fcntl.flock
+    monkeypatch.setattr(fcntl, "flock", lambda file, how: (real(file, how), path.unlink()))
+    with pytest.raises(InputError, match="is taken"), held(path, "is taken"):
+        pytest.fail("held")
+
+
 def test_an_error_leaves_nothing(tmp_path):
     """A block that fails leaves neither folder nor traces."""
     with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "out") as folder:
