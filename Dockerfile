@@ -1,6 +1,6 @@
 # The package on a plain CPU. In a checkout:
 #   docker build --tag arena-newton .
-#   docker run --rm --volume "$PWD/results:/work/results" arena-newton eval --out results/first
+#   docker run --rm --volume "$PWD/results:/arena/results" arena-newton eval --out results/first
 FROM python:3.12.12-slim-bookworm AS wheel
 RUN pip install --no-cache-dir hatchling==1.27.0
 COPY . /source
@@ -10,8 +10,8 @@ RUN hatchling build --target wheel --directory /wheels
 FROM python:3.12.12-slim-bookworm
 RUN pip install --no-cache-dir torch==2.11.0 torchvision==0.26.0 --index-url https://download.pytorch.org/whl/cpu
 COPY --from=wheel /wheels /wheels
-RUN pip install --no-cache-dir /wheels/*.whl && useradd --create-home arena && install --directory --owner arena /work
+RUN pip install --no-cache-dir /wheels/*.whl && useradd --create-home arena && install --directory --owner arena /arena
 USER arena
-WORKDIR /work
+WORKDIR /arena
 ENTRYPOINT ["arena-newton"]
 CMD ["--help"]

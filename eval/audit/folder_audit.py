@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from arena_newton.files.stored_json import JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["LEVELS", "Audit", "audited", "runs_in", "write_pages"]
+__all__ = ["LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
 
 MAX_DERIVED_BYTES = 512 << 20
 MOST_FAULTS = 1000
@@ -34,6 +34,14 @@ LEVELS = {
     RERUN: "the policy was asked again at its queries, and decided as recorded",
 }
 """Level to which a result was checked, from low to high → what is known then."""
+
+
+def print_findings(faults: Sequence[str], notes: Sequence[str]) -> None:
+    """Print contradictions and remarks, a line each."""
+    for fault in faults:
+        print(f"  contradiction: {fault}")
+    for note in notes:
+        print(f"  {note}")
 
 
 @dataclass

@@ -56,7 +56,7 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
     Raises:
         InputError: A folder holds no run, or cannot be read as one.
     """
-    from arena_newton.eval.audit.folder_audit import audited, runs_in, write_pages
+    from arena_newton.eval.audit.folder_audit import audited, print_findings, runs_in, write_pages
     from arena_newton.eval.records.chain import joint_head
     from arena_newton.files.text import counted
 
@@ -91,10 +91,7 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
             play_fresh(one, options.policy, options.fresh, draw, factories)
         audits.append(one)
         print(f"{folder}: {', '.join(f'{name} {value}' for name, value in one.facts())}")
-        for fault in one.faults:
-            print(f"  contradiction: {fault}")
-        for note in one.notes:
-            print(f"  {note}")
+        print_findings(one.faults, one.notes)
     joint = joint_head([one.results.get("head") for one in audits])
     if len(audits) > 1 and joint is not None:
         print(f"Head of {counted(len(audits), 'journal')}: {joint}.")

@@ -45,6 +45,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
     import tempfile
 
     from arena_newton.cli.flags import check_least, user_path
+    from arena_newton.eval.audit.folder_audit import print_findings
     from arena_newton.eval.leaderboard.checked_entry import check_entry
     from arena_newton.eval.leaderboard.entry_file import ENTRY_FILE
     from arena_newton.eval.leaderboard.site import write_site
@@ -73,10 +74,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
             one = check_entry(folder, into, replays=options.replay, draw=options.draw or 0, factories=factories)
             found.append(one)
             print(f"{folder}: {one.entry.level}, {counted(len(one.rates), 'rate')}")
-            for fault in one.faults:
-                print(f"  contradiction: {fault}")
-            for note in one.notes:
-                print(f"  {note}")
+            print_findings(one.faults, one.notes)
         if any(one.faults for one in found):
             return 1
         try:

@@ -292,12 +292,7 @@ class PolicyTrainer:
                 self._descend()
             gradients = [p.grad for p in self._parameters if p.grad is not None]
             norms.append(float(torch.nn.utils.get_total_norm(gradients)))
-        with torch.no_grad():
-            for name, tensor in self.model.policy.state_dict().items():
-                tensor.copy_(before[name])
-        if self._sums is not None:
-            self._sums.zero_()
-        self.optimizer.zero_grad(set_to_none=True)
+        self._put_back(before)
         own, compiled = norms
         if not own / LARGEST_RATIO <= compiled <= own * LARGEST_RATIO:
             raise ArenaError(
@@ -305,6 +300,15 @@ class PolicyTrainer:
                 f"own {own:.4g}: torch {torch.__version__} compiles it wrongly; train without --compile"
             )
         self._agrees = True
+
+    def _put_back(self, before: Mapping[str, torch.Tensor]) -> None:
+        """Give the network its tensors of before steps that do not count, and forget their losses and gradients."""
+        with torch.no_grad():
+            for name, tensor in self.model.policy.state_dict().items():
+                tensor.copy_(before[name])
+        if self._sums is not None:
+            self._sums.zero_()
+        self.optimizer.zero_grad(set_to_none=True)
 
     def _capture(self) -> None:
         """Capture a step: one graph, or two with the exchange of gradients between them.
@@ -325,13 +329,8 @@ class PolicyTrainer:
                 self._update()
         torch.cuda.current_stream(self.device).wait_stream(side)
         # Undone in the same tensors, whose addresses the graph keeps.
-        with torch.no_grad():
-            for name, tensor in self.model.policy.state_dict().items():
-                tensor.copy_(before[name])
+        self._put_back(before)
         _restore_moments(self.optimizer, moments)
-        if self._sums is not None:
-            self._sums.zero_()
-        self.optimizer.zero_grad(set_to_none=True)
         parts: list[Callable[[], None]] = [self._descend, self._update] if self.ranks > 1 else [self._whole]
         pool = torch.cuda.graph_pool_handle()
         for part in parts:

@@ -195,7 +195,7 @@ FILTERS = {
 
 @pytest.mark.parametrize("case", FILTERS)
 def test_lost_collisions_are_told_and_refused(written, case, once):
-    """Whatever keeps robot, ground and rule objects from meeting is reported as a change and named by `validate`."""
+    """Settings that part robot, ground and rule objects are reported as changes, and named by `validate`."""
     body, told, *faults = FILTERS[case]
     path = written(body)
     effects = [text for text in differences(path, "football") if "no longer meet" in text]

@@ -116,7 +116,7 @@ REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what 
 REPLAYED |= {"a failure made a success", "every failure made a success"}
 LEVEL = dict.fromkeys(REPLAYED, "replay")
 LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
-"""What finds a forgery, where lines alone do not; the world of these tests heeds no action."""
+"""Means that find a forgery, where lines alone do not; the world of these tests heeds no action."""
 
 
 @pytest.mark.parametrize("name", FORGERIES)

@@ -248,7 +248,7 @@ def test_rows_of_the_default_run_share_processes(inline, tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize(("cores", "viewer", "jobs"), [(8, (), 2), (1, (), 1), (2, ("--viewer", "usd"), 1)])
 def test_two_processes_play_the_default_run(tmp_path, monkeypatch, cores, viewer, jobs):
-    """Where there are two cores, and no viewer that shows worlds of this process."""
+    """Two processes play it on two cores or more, one on one core or where a viewer shows worlds of this process."""
     played = []
 
     def execute(folders, factories):
