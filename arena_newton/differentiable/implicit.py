@@ -198,7 +198,7 @@ class ImplicitWorld:
         base = self._residuals(weighed, given.targets, given.factors) if self._parameters else 0.0
         slopes = [(self._residuals(weighed, given.targets, factors) - base) / _FACTOR_STEP for factors in moved]
         at_factors = np.array(slopes, dtype=np.float64)
-        return Inputs(self._ambient(given.qpos, at_q, 2.0), at_v, np.zeros_like(given.carried), at_targets, at_factors)
+        return Inputs(self._ambient(given.qpos, at_q), at_v, np.zeros_like(given.carried), at_targets, at_factors)
 
     def _begin(self, given: Inputs) -> None:
         d = self._data
@@ -339,7 +339,7 @@ class ImplicitWorld:
             found[v : v + 3] = 0.5 * (_AXES @ qpos[q : q + 4]) @ gradient[q : q + 4]
         return found
 
-    def _ambient(self, qpos: np.ndarray, tangent: np.ndarray, turn: float) -> np.ndarray:
+    def _ambient(self, qpos: np.ndarray, tangent: np.ndarray, turn: float = 2.0) -> np.ndarray:
         """Moves or gradients in the coordinates of qpos, shape [..., nq], from tangent ones, shape [..., nv].
 
         Args:
