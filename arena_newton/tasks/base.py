@@ -34,6 +34,7 @@ from arena_newton.rules.rule_types import (
 
 if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
+    from arena_newton.tasks.interaction import Interaction
     from arena_newton.tasks.judge import Judge
 
 __all__ = [
@@ -331,6 +332,12 @@ class TaskSpec:
     """Binds the success condition to a built scene; raises `InputError` where a prim or marker is missing."""
     predicates: tuple[Predicate, ...] = (SUCCESS,)
     """Steps on the way to success, in order; the last one is the success condition itself."""
+    target: str = ""
+    """Prim of what its instruction names and the robot must find; empty: not given, and visibility is not certified."""
+    interaction: Interaction | None = None
+    """Its first contact; None: it has no failure signals."""
+    without_legs: str = ""
+    """Reason for which a base that glides in place of legs may solve it; empty: legs are needed."""
     events: Mapping[int, str] = field(default_factory=dict)
     """The judge's event number → reason of the timeout that it causes."""
     expert: str | None = None

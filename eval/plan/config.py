@@ -21,7 +21,6 @@ from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
 from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
-from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
     QUICK_SEEDS,
@@ -300,7 +299,9 @@ def resolve(options: RunOptions) -> RunConfig:
         tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
     if options.failures:
-        check_interactions(tasks)
+        without = [task for task in tasks if task_specs.get(task).interaction is None]
+        if without:
+            raise InputError(f"--failures: no signals are defined for {' '.join(without)} (`TaskSpec.interaction`)")
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several
