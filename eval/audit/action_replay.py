@@ -71,9 +71,9 @@ def found_probability(forged: float, episodes: int) -> float:
 
 def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
     """Flags by which the episodes of a run are played here with a policy, and flags of more kinds of the run."""
-    more = (Remote,) if policy.startswith("remote:") else ()
-    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds, *more) for name in flags_of(kind))
-    same = {name: getattr(stored, name) for name in (*groups_of, "task", "tracker", "seeds", "repeats", "checkpoint")}
+    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
+    others = (*Remote.names_for(policy), "task", "tracker", "seeds", "repeats", "checkpoint")
+    same = {name: getattr(stored, name) for name in (*groups_of, *others)}
     return RunOptions(**same | {"policy": policy, "engine": ENGINE, "device": "cpu", "actions": False})
 
 
