@@ -32,7 +32,9 @@ READING = {
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
     "Results": """docs/results/README docs/results/findings docs/results/reproductions
-        policies/weights/learned/card eval/tables/paper/README docs/certificate docs/performance""",
+        policies/weights/learned/card eval/tables/paper/README docs/performance docs/results/certificate/certify
+        docs/results/certificate/certify_1 docs/results/certificate/certify_2 docs/results/certificate/certify_3
+        docs/results/certificate/certify_4""",
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
 EXAMPLES = """first_episode own_policy own_tracker drive_by_code usd_variant record_and_build swap aim_a_kick
