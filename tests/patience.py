@@ -1,9 +1,11 @@
 """Deadlines of tests: short where the machine is quick, long where it is busy."""
 
+import time
+
 import pytest
 
 PLENTY = 120.0
-"""Deadline that nothing here comes near, however busy the machine is [s]."""
+"""Time that nothing here comes near, however busy the machine is [s]."""
 
 
 def patiently(check, deadlines=(0.3, 3.0, 30.0)):
@@ -14,3 +16,13 @@ def patiently(check, deadlines=(0.3, 3.0, 30.0)):
         except (Exception, pytest.fail.Exception):
             pass  # on a busy machine what is quick misses a short deadline too
     return check(deadlines[-1])
+
+
+def wait_for(check, what, seconds=PLENTY):
+    """Wait until a check gives something true, and return it."""
+    end = time.monotonic() + seconds
+    while not (found := check()):
+        if time.monotonic() > end:
+            pytest.fail(f"no {what} after {seconds:.0f} s", pytrace=False)
+        time.sleep(0.02)
+    return found
