@@ -46,6 +46,7 @@ __all__ = [
     "SUCCESS",
     "TOUCH",
     "Draws",
+    "Kind",
     "LightDraw",
     "ObjectSpec",
     "Overlap",
@@ -58,6 +59,10 @@ __all__ = [
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Sample = dict[str, float]
+Kind = Literal[
+    "body", "fixture", "target", "hinge", "latch", "marker", "collider", "camera", "light", "physics", "robot"
+]
+"""Kinds of prim that a scene may have to have; `usd_scenes.validate` tests them."""
 
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 FACE_PLUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
@@ -297,9 +302,8 @@ class Required:
     """A prim that a task's scene must have."""
 
     path: str
-    kind: str
-    """Required kind of prim: a key of the validator's table of kinds, such as `body`, `fixture`, `marker` or
-    `collider`."""
+    kind: Kind
+    """Required kind of prim, as docs/authoring.md describes them."""
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 

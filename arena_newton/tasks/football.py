@@ -10,7 +10,7 @@ from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRu
 from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import BodyFrame
 from arena_newton.tasks.interaction import Interaction
-from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near
+from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, origin
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
@@ -79,7 +79,7 @@ class FootballJudge(Judge):
         """Bind ball, goal and pitch."""
         self.rule: FootballRule = rules.task("football").success
         self.ball = scene.body_id(BALL)
-        ball, goal = BodyFrame(self.ball, (0.0, 0.0, 0.0), IDENTITY), scene.marker(GOAL)
+        ball, goal = origin(scene, BALL), scene.marker(GOAL)
         surface, speed = bounding_box(scene, BALL), scene.joint_qvel(BALL)
         toes = [BodyFrame(foot.body_id, TOE, IDENTITY) for foot in links(scene, *FEET)]
         super().__init__(

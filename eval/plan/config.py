@@ -291,9 +291,7 @@ def resolve(options: RunOptions) -> RunConfig:
     """
     check_flags(options)
     quick = is_quick(options)
-    tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
-    if quick and options.policy == "expert":  # a task that was added may have none
-        tasks = tuple(name for name in tasks if task_specs.get(name).expert is not None)
+    tasks = task_specs.PAPER if options.task in ((), ("all",)) else tuple(options.task)
     scheme, _, target = options.policy.partition(":")
     if scheme == "learned":
         card = _card(target)
