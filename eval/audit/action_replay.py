@@ -227,7 +227,7 @@ def played(
             env,
             policy,
             group,
-            recorder=recorders,
+            recorder=[*recorders, *made.recorders(env)],
             max_steps=group[0].max_steps,
             latency=latency,
             on_finish=results.append,
@@ -267,6 +267,7 @@ def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidenc
     """Hold an episode that was played again to its line."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
+    again |= {"extra": result.extra} if result.extra else {}
     again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)
