@@ -82,11 +82,7 @@ class Registry[T]:
             InputError: Unknown or doubled name, a package that does not load, or a maker that does not fit.
         """
         self.check(name)
-        if name not in self._registered and name in self.built_in:
-            module, _, attribute = self.built_in[name].partition(":")
-            own: Callable[..., T] | T = getattr(importlib.import_module(module), attribute)
-            return own if isinstance(own, self.base()) else own(*arguments, **options)
-        factory = self._registered.get(name) or self._loaded(name)
+        factory = self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
         if isinstance(factory, self.base()):
             return factory
         if not callable(factory):
@@ -102,6 +98,11 @@ class Registry[T]:
             kind = self.base().__name__
             raise InputError(f"--{self.noun} {name}: its factory makes a {type(made).__name__}, not a {kind}")
         return made
+
+    def _own(self, name: str) -> Callable[..., T] | T:
+        module, _, attribute = self.built_in[name].partition(":")
+        factory: Callable[..., T] | T = getattr(importlib.import_module(module), attribute)
+        return factory
 
     def _loaded(self, name: str) -> Callable[..., T] | T:
         try:

@@ -62,7 +62,7 @@ class Tested:
     policy: str = "expert"
     """Policy that decides it: expert, stand, learned (the one that comes with the package; learned:<folder of eval
     pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of a run>, replay:<LeRobot
-    dataset>#<episode, or all>, remote:<url>."""
+    dataset>#<episode, or all>, remote:<url>, process:<command>."""
 
 
 @dataclass(frozen=True)
@@ -210,13 +210,18 @@ class Remote:
     """Requests to a policy server."""
 
     remote_timeout: float = 60.0
-    """For --policy remote: deadline of a request with all its attempts [s]."""
+    """For --policy remote and process: deadline of a request with all its attempts [s]."""
     remote_retries: int = 4
     """For --policy remote: repeated attempts after a connection error, with pauses of 0.25, 0.5, 1 ... s."""
     remote_sequential: bool = False
     """For --policy remote: ask for one world after the other, in their order."""
     remote_insecure: bool = False
     """For --policy remote: do not check the certificate of an https server."""
+
+    @staticmethod
+    def names_for(policy: str) -> tuple[str, ...]:
+        """Names of the flags that belong to a policy, which its spec names."""
+        return {"remote": flags_of(Remote), "process": ("remote_timeout",)}.get(policy.partition(":")[0], ())
 
 
 @dataclass(frozen=True)

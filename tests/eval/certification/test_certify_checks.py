@@ -190,7 +190,7 @@ def test_a_mode_that_moves_more_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(axes, "_reset_faults", lambda context, task: [])
     options = CertifyOptions(out=str(tmp_path), task=("boxing",), checks=("execution",), quick=True)
     assert certify.run(options) == 1
-    text = (tmp_path / "certify.md").read_text()
+    text = (tmp_path / "certify_1.md").read_text()
     assert "boxing under paper: mode semantic moves boxing\\_target" in text.replace("boxing_target", "boxing\\_target")
     assert "z is drawn from 1." in text
 
