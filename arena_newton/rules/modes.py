@@ -15,7 +15,19 @@ from arena_newton.errors import InputError
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
 
-__all__ = ["BUILT_IN", "DYNAMICS", "HELD_OUT", "QUANTITIES", "Mode", "Quantity", "check", "get", "names", "register"]
+__all__ = [
+    "BUILT_IN",
+    "DYNAMICS",
+    "HELD_OUT",
+    "QUANTITIES",
+    "Mode",
+    "Quantity",
+    "check",
+    "get",
+    "names",
+    "register",
+    "unregister",
+]
 
 DYNAMICS = "dynamics"
 """Record name of what a mode draws about an episode's dynamics, next to the names of the objects."""
@@ -138,12 +150,12 @@ BUILT_IN = {
 """The paper's four test modes, base, execution, semantic and visual; the held-out looks; and dynamics."""
 HELD_OUT = tuple(mode.name for mode in BUILT_IN.values() if mode.scene == "layer")
 """Modes whose looks are a layer of their own."""
-_registry = Registry[Mode]("mode", "arena_newton.modes", lambda: Mode, dict.fromkeys(BUILT_IN, ""))
+_MODES = Registry[Mode]("mode", "arena_newton.modes", lambda: Mode, dict.fromkeys(BUILT_IN, ""))
 
 
 def names() -> tuple[str, ...]:
     """Names of all modes: the built-in ones, then those of other packages."""
-    return (*BUILT_IN, *(name for name in _registry.names() if name not in BUILT_IN))
+    return (*BUILT_IN, *(name for name in _MODES.names() if name not in BUILT_IN))
 
 
 def check(name: str) -> None:
@@ -165,16 +177,19 @@ def get(name: str) -> Mode:
     if name in BUILT_IN:
         return BUILT_IN[name]
     check(name)
-    mode = _registry.make(name)
+    mode = _MODES.make(name)
     if mode.name != name:
-        raise InputError(f"--mode {name}: its factory makes the mode {mode.name}")
+        raise InputError(f"--mode {name}: its package calls it {mode.name}; entry point and record need one name")
     return mode
 
 
-def register(name: str, factory: Callable[[], Mode]) -> None:
+def register(mode: Mode) -> None:
     """Offer a mode in this process; packages offer theirs as entry points of the group `arena_newton.modes`.
 
     Raises:
         InputError: A built-in one has that name.
     """
-    _registry.register(name, factory)
+    _MODES.register(mode.name, mode)
+
+
+unregister = _MODES.unregister

@@ -15,7 +15,8 @@ class CertifyOptions(Jobs):
     """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
 
     The tasks' experts play in all checks but policy-inputs, execution, dynamics, physics, camera and statistics. Exit
-    code 0: no check fails; 1: one fails; 2: bad input. --jobs 0 only plays and writes no page, as each of several processes does.
+    code 0: no check fails; 1: one fails; 2: bad input. --jobs 0 only plays and writes no page, as each of several
+    processes does.
     """
 
     out: str = "results/certify"

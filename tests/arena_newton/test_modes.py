@@ -24,19 +24,16 @@ WORLDS = 4
 NAN = float("nan")
 
 
-def wet() -> Mode:
-    """A mode of another package."""
-    return Mode(
-        name="wet", sentence="slippery", placements=lambda rule: rule.execution, dynamics={"friction": (0.2, 0.4)}
-    )
+WET = Mode(name="wet", sentence="slippery", placements=lambda rule: rule.execution, dynamics={"friction": (0.2, 0.4)})
+"""A mode of another package."""
 
 
 @pytest.fixture
 def offered(monkeypatch):
     """The mode as an installed package offers it."""
-    point = EntryPoint("wet", f"{__name__}:wet", "arena_newton.modes")
+    point = EntryPoint("wet", f"{__name__}:WET", "arena_newton.modes")
     monkeypatch.setattr(registry, "_installed", lambda group, path: [point] if group == point.group else [])
-    monkeypatch.setattr(EntryPoint, "load", lambda self: wet)
+    monkeypatch.setattr(EntryPoint, "load", lambda self: WET)
 
 
 def test_a_mode_of_another_package_is_played_and_hashed(offered):
@@ -70,7 +67,7 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
 def test_ranges_that_are_none_are_refused(change, message):
     """An unknown quantity, reversed bounds, a fraction of a tick: one line that names mode and quantity."""
     with pytest.raises(InputError, match=message):
-        dataclasses.replace(wet(), **change)
+        dataclasses.replace(WET, **change)
 
 
 def test_names_are_refused_in_words(offered, monkeypatch):
@@ -78,16 +75,16 @@ def test_names_are_refused_in_words(offered, monkeypatch):
     with pytest.raises(InputError, match="--mode night: unknown, choose from base, .*, dynamics, wet"):
         modes.get("night")
     with pytest.raises(InputError, match="mode 'visual': is built in"):
-        modes.register("visual", wet)
-    monkeypatch.setitem(modes._registry._registered, "dry", wet)
-    with pytest.raises(InputError, match="--mode dry: its factory makes the mode wet"):
+        modes.register(dataclasses.replace(WET, name="visual"))
+    monkeypatch.setitem(modes._MODES._registered, "dry", WET)
+    with pytest.raises(InputError, match="--mode dry: its package calls it wet; entry point and record need one name"):
         modes.get("dry")
 
 
 def test_a_hash_holds_all_ranges():
     """The hash of a mode changes with each range, its light and its scene, and with the rule set where that counts."""
     mode, changed = (
-        wet(),
+        WET,
         [
             {"placements": lambda rule: rule.base},
             {"dynamics": {"friction": (0.2, 0.5)}},
@@ -101,7 +98,7 @@ def test_a_hash_holds_all_ranges():
     }
     assert len(hashes) == len(changed) + 1
     assert mode.hash_for(PAPER, ["double_desk"]) != mode.hash_for(rule_sets.get("released"), ["double_desk"])
-    assert mode.hash_for(PAPER, ["boxing", "football"]) == wet().hash_for(PAPER, ("football", "boxing"))
+    assert mode.hash_for(PAPER, ["boxing", "football"]) == WET.hash_for(PAPER, ("football", "boxing"))
 
 
 def test_each_quantity_has_a_stream_of_its_own():
