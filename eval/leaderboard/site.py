@@ -22,7 +22,7 @@ from arena_newton.files.stored_json import read_regular
 from arena_newton.files.text import plain
 from arena_newton.pages.html import FILES, render
 from arena_newton.pages.tables import between, percent
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules import modes
 from arena_newton.tasks.semantic_mode import semantic_notes, task_title
 
 __all__ = ["write_site"]
@@ -132,7 +132,7 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
     filters = {
         "level": [level for level in LEVELS if any(row.level == level for row in shown)],
         "tracker": sorted({one for row in shown for one in row.tracker.split("+")}),
-        "mode": [mode for mode in MODES if any(row.mode == mode for row in shown)],
+        "mode": [mode for mode in modes.names() if any(row.mode == mode for row in shown)],
         "data": sorted({row.checked.entry.training_data for row in shown}),
     }
     columns = ("mean", *map(task_title, suites()["ALL_AVG"]))
