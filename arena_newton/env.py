@@ -185,7 +185,7 @@ class ArenaEnv:
             "physics_dt": self.rate.dt,
             "substeps": self.rate.substeps,
             "drive": self.drive.name,
-            "gains": {key: value for key, value in dataclasses.asdict(self.drive).items() if key != "name"},
+            "gains": {key: value for key, value in self.drive.as_json().items() if key != "name"},
             "startup_ticks": self.startup_ticks,
             "history": self.rules.startup.history,
             "tracker": self.tracker.describe(),

@@ -207,7 +207,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         try:
             return read_facts(content if isinstance(content, dict) else {}, f"{self.url}/config")
         except WireError as error:
-            raise InputError(f"--policy remote: {self.masked(str(error))}") from None
+            raise InputError(f"--policy {self.name}: {self.masked(str(error))}") from None
 
     def _connect(self) -> _Connection:
         server = (self.address.host, self.address.port)
