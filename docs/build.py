@@ -39,7 +39,7 @@ READING = {
         docs/results/certificate/certify_4""",
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
-EXAMPLES = """first_episode own_policy own_tracker drive_by_code usd_variant record_and_build swap aim_a_kick
+EXAMPLES = """first_episode own_policy own_tracker own_mode drive_by_code usd_variant record_and_build swap aim_a_kick
     refine_reference compare_runs""".split()
 CONFIGURATION = {
     "project": PROJECT["name"],

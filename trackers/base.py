@@ -95,7 +95,7 @@ _TRACKERS: Registry[Tracker] = Registry(
     "tracker",
     ENTRY_POINT_GROUP,
     lambda: Tracker,
-    {"pd": "arena_newton.trackers.pd:from_checkpoint"}
+    {name: f"arena_newton.trackers.{name}:from_checkpoint" for name in ("mjlab", "pd")}
     | {name: f"{module}:from_checkpoint" for name, module in interface.MODULES.items()},
 )
 

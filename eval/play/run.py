@@ -310,8 +310,7 @@ class RunPlayer:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
             own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()} | shown_by(config.cameras)
             research = self.factories.recorders(env)
-            codes = {code for part in (env, *research) if (code := own_code(part)) is not None}
-            own |= {"code": config_hash(sorted(codes))} if codes else {}
+            own |= {"recorders": config_hash(sorted({own_code(one) or "" for one in research}))} if research else {}
             for names in groups(order):
                 facts = self.folder.register(" ".join(names), own)
             if flags.verbose:
