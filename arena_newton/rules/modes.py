@@ -15,19 +15,8 @@ from arena_newton.errors import InputError
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
 
-__all__ = [
-    "BUILT_IN",
-    "DYNAMICS",
-    "HELD_OUT",
-    "QUANTITIES",
-    "Mode",
-    "Quantity",
-    "check",
-    "get",
-    "names",
-    "register",
-    "unregister",
-]
+__all__ = ["BUILT_IN", "DYNAMICS", "HELD_OUT", "QUANTITIES", "Mode", "Quantity"]
+__all__ += ["get", "names", "register", "unregister"]
 
 DYNAMICS = "dynamics"
 """Record name of what a mode draws about an episode's dynamics, next to the names of the objects."""
@@ -107,11 +96,8 @@ class Mode:
 
     def hash_for(self, rules: RuleSet, tasks: Iterable[str]) -> str:
         """Hash of its ranges and of its scene's name, for some tasks under a rule set: 12 hex digits."""
-        ranges = [
-            [one.record, dataclasses.asdict(self.placements(one))]
-            for t in sorted(tasks)
-            for one in rules.task(t).objects
-        ]
+        objects = [one for task in sorted(tasks) for one in rules.task(task).objects]
+        ranges = [[one.record, dataclasses.asdict(self.placements(one))] for one in objects]
         light = None if self.light is None else dataclasses.asdict(self.light(rules))
         text = json.dumps([self.scene, ranges, light, sorted(self.dynamics.items())], separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -158,26 +144,15 @@ def names() -> tuple[str, ...]:
     return (*BUILT_IN, *(name for name in _MODES.names() if name not in BUILT_IN))
 
 
-def check(name: str) -> None:
-    """Refuse what is not the name of a mode.
-
-    Raises:
-        InputError: Unknown name; the message lists the known ones.
-    """
-    if name not in names():
-        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
-
-
 def get(name: str) -> Mode:
     """A mode by name.
 
     Raises:
-        InputError: Unknown mode, or a package that does not offer one.
+        InputError: Unknown name, or a package that offers something else.
     """
-    if name in BUILT_IN:
-        return BUILT_IN[name]
-    check(name)
-    mode = _MODES.make(name)
+    if name not in names():
+        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
+    mode = BUILT_IN.get(name) or _MODES.make(name)
     if mode.name != name:
         raise InputError(f"--mode {name}: its package calls it {mode.name}; entry point and record need one name")
     return mode
