@@ -228,6 +228,8 @@ class EpisodeResult:
     """Progress as in `Verdict`."""
     events: tuple[EpisodeEvent, ...] = ()
     """Events as in `Verdict`."""
+    extra: dict[str, float] = field(default_factory=dict)
+    """Metrics of recorders by name, which `Recorder.finish` may add: finite numbers."""
 
 
 class Planned(Protocol):
@@ -449,7 +451,10 @@ class World(Protocol):
 
 
 class Recorder:
-    """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs."""
+    """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs.
+
+    A metric of an episode is added to `EpisodeResult.extra` in `finish`; it must not change the worlds.
+    """
 
     wants_observation: bool = False
     """True if `before_physics` needs the observation of every tick, which costs a kernel launch."""

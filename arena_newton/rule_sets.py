@@ -41,7 +41,7 @@ def get(name: str) -> RuleSet:
         InputError: Unknown name.
     """
     check_name(name)
-    return _assembled(name, tuple(tasks.get(task) for task in tasks.names()))
+    return _assembled(name, tasks.specs())
 
 
 @functools.lru_cache(maxsize=4)

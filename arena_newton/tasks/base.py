@@ -34,6 +34,7 @@ from arena_newton.rules.rule_types import (
 
 if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
+    from arena_newton.tasks.interaction import Interaction
     from arena_newton.tasks.judge import Judge
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "SUCCESS",
     "TOUCH",
     "Draws",
+    "Kind",
     "LightDraw",
     "ObjectSpec",
     "Overlap",
@@ -57,6 +59,10 @@ __all__ = [
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Sample = dict[str, float]
+Kind = Literal[
+    "body", "fixture", "target", "hinge", "latch", "marker", "collider", "camera", "light", "physics", "robot"
+]
+"""Kinds of prim that a scene may have to have; `usd_scenes.validate` tests them."""
 
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 FACE_PLUS_Y: Quat = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
@@ -296,9 +302,8 @@ class Required:
     """A prim that a task's scene must have."""
 
     path: str
-    kind: str
-    """Required kind of prim: a key of the validator's table of kinds, such as `body`, `fixture`, `marker` or
-    `collider`."""
+    kind: Kind
+    """Required kind of prim, as docs/authoring.md describes them."""
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 
@@ -331,6 +336,12 @@ class TaskSpec:
     """Binds the success condition to a built scene; raises `InputError` where a prim or marker is missing."""
     predicates: tuple[Predicate, ...] = (SUCCESS,)
     """Steps on the way to success, in order; the last one is the success condition itself."""
+    target: str = ""
+    """Prim of what its instruction names and the robot must find; empty: not given, and visibility is not certified."""
+    interaction: Interaction | None = None
+    """Its first contact; None: it has no failure signals."""
+    without_legs: str = ""
+    """Reason for which a base that glides in place of legs may solve it; empty: legs are needed."""
     events: Mapping[int, str] = field(default_factory=dict)
     """The judge's event number → reason of the timeout that it causes."""
     expert: str | None = None

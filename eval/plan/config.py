@@ -21,7 +21,6 @@ from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
 from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
-from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
     QUICK_SEEDS,
@@ -58,6 +57,7 @@ from arena_newton.pictures.settings import (
 )
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
+from arena_newton.policies.remote.program import ProgramCommand
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
@@ -291,16 +291,16 @@ def resolve(options: RunOptions) -> RunConfig:
     """
     check_flags(options)
     quick = is_quick(options)
-    tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
-    if quick and options.policy == "expert":  # a task that was added may have none
-        tasks = tuple(name for name in tasks if task_specs.get(name).expert is not None)
+    tasks = task_specs.PAPER if options.task in ((), ("all",)) else tuple(options.task)
     scheme, _, target = options.policy.partition(":")
     if scheme == "learned":
         card = _card(target)
         tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
     if options.failures:
-        check_interactions(tasks)
+        without = [task for task in tasks if task_specs.get(task).interaction is None]
+        if without:
+            raise InputError(f"--failures: no signals are defined for {' '.join(without)} (`TaskSpec.interaction`)")
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several
@@ -314,6 +314,9 @@ def resolve(options: RunOptions) -> RunConfig:
     else:
         policy_path, ending = None, ""
     label = f"{scheme}:{_shown(policy_path)}{ending}" if policy_path else options.policy
+    program = ProgramCommand.read(target) if scheme == "process" else None
+    if program is not None:
+        options, label = dataclasses.replace(options, policy=f"process:{program.text}"), f"process:{program.shown}"
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
@@ -359,6 +362,8 @@ def resolve(options: RunOptions) -> RunConfig:
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
+    if program is not None and program.decisive:
+        policy_hash = config_hash([hash_path(file) for file in program.decisive])
     variant_hash = layers_hash(variant) if variant else None
     if options.dealt:
         engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
@@ -476,6 +481,8 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 def _policy_options(options: RunOptions) -> JsonObject:
     """Arguments of a policy besides its spec."""
     scheme = options.policy.partition(":")[0]
+    if scheme == "process":
+        return {"timeout": options.remote_timeout, "labels": options.labels or "v3.1"}
     if scheme == "remote":
         return {
             "timeout": options.remote_timeout,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import importlib
 import inspect
 import json
 import os
@@ -210,9 +212,15 @@ def layers_hash(stage: Path) -> str:
 
 
 def foreign_task(spec: TaskSpec) -> JsonObject:
-    """Hashes of a task's scene, with all that it names, and of the package of its judge and sampler, unless ours."""
-    codes = {code for part in (spec.judge, spec.sample) if (code := own_code(part)) is not None}
-    facts: JsonObject = {"code": config_hash(sorted(codes))} if codes else {}
+    """Hashes of a task's scene, with all that it names, and of the packages of judge, sampler and expert, unless ours.
+
+    A kernel is hashed with the package of the judge that launches it.
+    """
+    codes = {own_code(spec.judge), own_code(spec.sample)}
+    if spec.expert is not None:
+        codes.add(_package_code(spec.expert.partition(":")[0]))
+    codes.discard(None)
+    facts: JsonObject = {"code": config_hash(sorted(filter(None, codes)))} if codes else {}
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
     return facts
@@ -226,11 +234,18 @@ def own_code(part: object) -> str | None:
     """
     if isinstance(part, functools.partial):
         part = part.func
-    module = sys.modules.get((part if inspect.isclass(part) or inspect.isroutine(part) else type(part)).__module__)
-    name = module.__name__.partition(".")[0] if module is not None else ""
-    if name in {"", "arena_newton", *sys.stdlib_module_names}:
+    return _package_code((part if inspect.isclass(part) or inspect.isroutine(part) else type(part)).__module__)
+
+
+def _package_code(path: str) -> str | None:
+    """Hash of the package that a module is in, or of the single module; None for ours and Python's."""
+    name = path.partition(".")[0]
+    if name in {"arena_newton", *sys.stdlib_module_names}:
         return None
-    top = sys.modules.get(name)
+    if getattr(sys.modules.get(name), "__file__", None) is None:
+        with contextlib.suppress(Exception):  # who plays an expert says why it does not load
+            importlib.import_module(path)
+    module, top = sys.modules.get(path), sys.modules.get(name)
     whole = getattr(top, "__file__", None) is not None  # not so of a namespace, which other packages may be in too
     file = getattr(top if whole else module, "__file__", None)
     if file is None:

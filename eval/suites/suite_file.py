@@ -175,7 +175,7 @@ def read_suite_file(path: Path) -> SuiteFile:
     where = f"{path}: [matrix]"
     axes = MatrixAxes(**_values(where, _table(path, content, "matrix"), MatrixAxes))
     if axes.tasks == ("all",):
-        axes = dataclasses.replace(axes, tasks=tasks.names())
+        axes = dataclasses.replace(axes, tasks=tasks.PAPER)
     _check_axes(where, axes, required=True)
     for entry in policies:
         _check_within(f"{path}: [[policies]] {entry.name}", entry, axes)

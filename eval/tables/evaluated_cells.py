@@ -137,7 +137,7 @@ def _of_row(
         policy=plain_text(row.get("policy") or "", 80),
         family=plain_text(row.get("family") or "", 80),
         trained_on=trained_on,
-        trained_tasks=tuple(tasks.names()) if merged else (row["task"],),
+        trained_tasks=tasks.PAPER if merged else (row["task"],),
         tracker=plain_text(row.get("tracker") or "", 80),
         task=row["task"],
         mode=mode,

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, changed_conditions, due_episodes
-from arena_newton.eval.statistics.stats import wilson
+from arena_newton.eval.reports.report import metrics
+from arena_newton.eval.statistics.stats import aggregate, wilson
 from arena_newton.eval.tables.episode_table import (
     NAMED,
     EvaluatedCell,
@@ -59,7 +60,8 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     head = ["task", "tracker", *(["policy"] if len(policies) > 1 else []), *modes]
     table = Table(head, rows, "l" * (len(head) - len(modes)) + "r").markdown()
     notes = "".join(f"{note}\n" for note in _notes(runs, [cell for _, cell in found]))
-    return f"{table}\n{_conditions(runs, policies, weights)}\n{notes}"
+    measured = metrics([found for run in runs for found in aggregate(run.records)["cells"]])
+    return f"{table}\n{_conditions(runs, policies, weights)}\n{notes}{measured}"
 
 
 def _policy(cell: EvaluatedCell) -> str:

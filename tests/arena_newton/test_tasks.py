@@ -246,7 +246,7 @@ def test_held_out_looks_are_layers_of_their_own():
 
 def test_unknown_task_and_mode_are_refused():
     """One clear line that names what there is."""
-    with pytest.raises(InputError, match=r"--task golf: unknown, choose from football, .* or all"):
+    with pytest.raises(InputError, match=r"--task golf: unknown task; known are boxing, .*, vis_navi"):
         tasks.get("golf")
     with pytest.raises(InputError, match="--mode night: unknown"):
         tasks.get("boxing").draw(1, "night", PAPER)
