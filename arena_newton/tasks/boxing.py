@@ -19,13 +19,13 @@ from arena_newton.tasks.base import (
     draw_uniform,
     object_range,
 )
-from arena_newton.tasks.judge import PALMS, Judge, links, near, palms
+from arena_newton.tasks.judge import Judge, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
     from arena_newton.physics.scene import Scene
 
-__all__ = ["PALMS", "TASK", "BoxingJudge", "BoxingRule"]
+__all__ = ["TASK", "BoxingJudge", "BoxingRule"]
 
 TARGET = "/World/Target"
 BOUNDS = f"{TARGET}/Frame/Bounds"

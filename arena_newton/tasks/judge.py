@@ -14,6 +14,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 from arena_newton.tasks.handles import BodyFrame, Marker
 
@@ -25,9 +26,8 @@ if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
     from arena_newton.physics.scene import Scene
 
-__all__ = ["PALMS", "Condition", "Judge", "above", "bounding_box", "links", "near", "palms", "top"]
+__all__ = ["Condition", "Judge", "above", "bounding_box", "links", "near", "palms", "top"]
 
-PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 _ABOVE = 50.0
 """Half extent of the box that represents everything above a height [m]: larger than any scene."""
 

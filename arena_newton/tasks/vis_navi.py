@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import ANKLES
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
@@ -31,8 +32,6 @@ __all__ = ["TASK", "VisNaviJudge", "VisNaviRule"]
 
 SIGN = "/World/TargetSign"
 ZONE = f"{SIGN}/Frame/Zone"
-FEET = tuple(f"{side}_ankle_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll"))
-
 
 PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the marked area, seen from above"),
@@ -47,7 +46,7 @@ class VisNaviRule(SuccessRule):
 
     round_signs: bool
     """True if a zone that the stage marks as round (semantic mode's ring) is the disc in its box instead of the box."""
-    feet: tuple[str, ...] = FEET
+    feet: tuple[str, ...] = ANKLES
     """Links whose origins must be inside."""
 
     def sentence(self) -> str:

@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from arena_newton.errors import InputError
+from arena_newton.robot.g1 import ANKLES, FEET, PALMS, TOE
 from arena_newton.tasks.base import TOUCH
-from arena_newton.tasks.boxing import BOUNDS, PALMS, TARGET
+from arena_newton.tasks.boxing import BOUNDS, TARGET
 from arena_newton.tasks.double_desk import HAMMER
-from arena_newton.tasks.football import BALL, KICK, TOE
-from arena_newton.tasks.football import FEET as KICKING
+from arena_newton.tasks.football import BALL, KICK
 from arena_newton.tasks.open_door import HANDLE, LEAF_BODY
 from arena_newton.tasks.pp_box import BOX
 from arena_newton.tasks.sit_sofa import SEAT
-from arena_newton.tasks.vis_navi import FEET, SIGN, ZONE
+from arena_newton.tasks.vis_navi import SIGN, ZONE
 
 __all__ = ["INTERACTIONS", "Interaction", "check_interactions"]
 
@@ -66,11 +66,13 @@ INTERACTIONS: Mapping[str, Interaction] = {
     # off the bag's axis with the target 0.1 to 0.3 rad to its side; a hand reaches 45 degrees aside without a step.
     "boxing": Interaction(TARGET, BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
-    "vis_navi": Interaction(SIGN, ZONE, FEET, touch=0.0, stance=0.30, predicate="enter", level=True, reached_only=True),
+    "vis_navi": Interaction(
+        SIGN, ZONE, ANKLES, touch=0.0, stance=0.30, predicate="enter", level=True, reached_only=True
+    ),
     # The toe's distance is the one of the task's own `contact`. It is 0.12 m before the ankle and swings another 0.3 m
     # ahead while the other foot stands. The expert walks through the ball, and turns and steps back below 0.35 m/s.
     "football": Interaction(
-        BALL, BALL, KICKING, touch=KICK, stance=0.40, predicate="contact", bearing=0.8, loose=True, slow=0.35, tip=TOE
+        BALL, BALL, FEET, touch=KICK, stance=0.40, predicate="contact", bearing=0.8, loose=True, slow=0.35, tip=TOE
     ),
     # The origin of a pelvis that sits is 0.17 m above the box; a robot that comes down without weight stays some
     # centimetres higher. The expert goes down from 0.12 m in front of the edge. Cartons stand
