@@ -14,6 +14,7 @@ from arena_newton.cli.command_line import exit_code, program
 from arena_newton.cli.flags import parse_flags
 from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.rules.modes import BUILT_IN, DYNAMICS, QUANTITIES
 from arena_newton.rules.rule_types import (
     ByRules,
     CylinderRange,
@@ -41,7 +42,7 @@ def get(name: str) -> RuleSet:
         InputError: Unknown name.
     """
     check_name(name)
-    return _assembled(name, tuple(tasks.get(task) for task in tasks.names()))
+    return _assembled(name, tasks.specs())
 
 
 @functools.lru_cache(maxsize=4)
@@ -229,6 +230,10 @@ def markdown() -> str:
         for case in spec.overlaps
         for things in [" and ".join(path.removeprefix("/World/") for path in (case.first, case.second))]
     ]
+    drawn = [
+        (f"`{name}`", _span(bounds), QUANTITIES[name].unit, QUANTITIES[name].sentence)
+        for name, bounds in BUILT_IN[DYNAMICS].dynamics.items()
+    ]
     head = ("task", "things", "`--rules`", "`--mode`", "episodes of 60", "deepest [m]", "because")
     lines = [
         "# Rule sets",
@@ -238,6 +243,16 @@ def markdown() -> str:
         "This page is generated: `python -m arena_newton.rule_sets > docs/rules.md`.",
         "",
         *Table(("item", *(f"`{s.name}`" for s in sets)), items).compact(),
+        "",
+        "## Modes",
+        "",
+        "A mode changes base mode's episodes in what its line says, and in nothing else.",
+        "",
+        *Table(("`--mode`", "change"), [(f"`{mode.name}`", mode.sentence) for mode in BUILT_IN.values()]).compact(),
+        "",
+        "`dynamics` draws these once per episode, each by a generator of its own, under both rule sets:",
+        "",
+        *Table(("quantity", "range", "unit", "meaning"), drawn).compact(),
         "",
         "## Where both sets depart from the original",
         "",

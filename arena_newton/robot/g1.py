@@ -4,7 +4,8 @@ Numbers are facts of the original benchmark (its controller and asset configurat
 Vectors over the 29 body joints are in MuJoCo order unless the name says otherwise.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 __all__ = [
     "ANKLES",
@@ -131,6 +132,12 @@ class DriveGains:
     """Finger torque limit [N·m]: Unitree's of thumb_0; in its model the other six have 1.4 (docs/rules.md)."""
     finger_armature: float = 0.01
     """Finger rotor inertia [kg·m²]."""
+    armature: tuple[float, ...] | None = None
+    """Rotor inertia of the body joints [kg·m²], 29; None: the scene's, which is that of Unitree's model."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Fields by name, rotor inertia only where it is declared."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 def _symmetric(leg: tuple, waist: tuple, arm: tuple) -> tuple[float, ...]:

@@ -22,6 +22,7 @@ from arena_newton.tasks.base import (
     object_range,
     sample_pose,
 )
+from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Judge, links, near
 
 if TYPE_CHECKING:
@@ -165,6 +166,13 @@ TASK = TaskSpec(
     success=ByRules(paper=VisNaviRule(round_signs=False), released=VisNaviRule(round_signs=True)),
     judge=VisNaviJudge,
     predicates=PREDICATES,
+    target=SIGN,
+    # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
+    interaction=Interaction(ZONE, ANKLES, touch=0.0, stance=0.30, predicate="enter", level=True, reached_only=True),
+    without_legs=(
+        "the rule asks for both ankle links inside the area's box and an upright robot; legs that hang still from a "
+        "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"
+    ),
     semantic_change="shape",
     recolour={SIGN: 0.0},
     expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",

@@ -131,7 +131,7 @@ def suites() -> dict[str, tuple[str, ...]]:
 
     `outside_suites` names other tasks.
     """
-    named = {suite: tuple(t for t in tasks.names() if tasks.get(t).suite == suite) for suite in ("HOI", "HSI")}
+    named = {suite: tuple(t for t in tasks.PAPER if tasks.get(t).suite == suite) for suite in ("HOI", "HSI")}
     return {f"{suite}_AVG": names for suite, names in named.items()} | {"ALL_AVG": named["HOI"] + named["HSI"]}
 
 

@@ -295,7 +295,7 @@ def _checkpoint(argument: str) -> Path:
 
 def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: CheckpointFacts) -> SuiteCell:
     """A cell held to what its checkpoint says of its training."""
-    names = {tasks.get(name).gym_id: name for name in tasks.names()}
+    names = {spec.gym_id: spec.name for spec in tasks.specs()}
     learned, path = tuple(names.get(task, task) for task in facts.tasks), cell.spec.partition(":")[2]
     claims = (
         ("labels", (entry.labels,) if entry.labels else (), (facts.labels,)),

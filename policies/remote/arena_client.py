@@ -1,7 +1,7 @@
 """The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
 
 A server of that protocol knows one robot only, so there is one request per world. `from_spec` also knows the protocols
-of other servers (docs/serving.md), each in its own module `remote_*`.
+of other servers (docs/asking_servers.md), each in its own module `remote_*`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """The batch of worlds: resets, observations, steps, verdicts; what happens to one world changes no bit of another."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -154,6 +156,20 @@ def test_a_drive_can_be_chosen():
         assert env.describe()["drive"] == env.drive.name == name
         gains = env.physics.mj_model.actuator_gainprm[env.scene.robot.joint_ctrl, 0]
         assert np.allclose(gains, env.drive.kp)
+        assert "armature" not in env.describe()["gains"]
+
+
+def test_a_drive_declares_the_rotor_inertia_that_its_gains_are_made_for():
+    """Declared rotor inertia is that of the body joints, and is described; fingers and root keep theirs."""
+    declared = tuple(0.01 + 0.001 * joint for joint in range(29))
+    tracker = trackers.get("pd")
+    plain = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco")
+    drive = dataclasses.replace(tracker.drive, armature=declared)
+    env = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco", drive=drive)
+    found, body = env.physics.mj_model.dof_armature, env.scene.robot.joint_qvel
+    assert np.allclose(found[body], declared) and env.describe()["gains"]["armature"] == declared
+    others = np.setdiff1d(np.arange(len(found)), body)
+    assert np.array_equal(found[others], plain.physics.mj_model.dof_armature[others])
 
 
 def test_a_fall_counts_in_the_startup_whatever_the_predicate_says(won):

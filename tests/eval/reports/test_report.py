@@ -383,7 +383,7 @@ def test_page_in_a_browser(tmp_path, browser):
     command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900", "--virtual-time-budget=2000"]
     command += ["--dump-dom", (tmp_path / "probe.html").as_uri()]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    page = subprocess.run(command, capture_output=True, text=True, timeout=500).stdout
     frames = [frame.split(",") for frame in re.search("<p>(.*)</p>", page)[1].split(";")]
     assert all(frame[2] == "false" and "12 of 12 episodes" in frame[3] for frame in frames), frames
     narrow, small, wide, large = (int(number) for frame in frames for number in frame[:2])
