@@ -48,10 +48,10 @@ from arena_newton.eval.play.signal_recorder import SEEN, SignalRecorder
 from arena_newton.eval.records.journal import EpisodeRecord, Journal, read_journal
 from arena_newton.eval.reports import report
 from arena_newton.policies.experts import ExpertPolicy, Sight
-from arena_newton.robot.g1 import DEFAULT_POSE, LEGS
+from arena_newton.robot.g1 import DEFAULT_POSE, LEGS, TOE
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-from arena_newton.tasks.football import BALL, GOAL, TOE
+from arena_newton.tasks.football import BALL, GOAL
 from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
