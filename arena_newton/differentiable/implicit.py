@@ -330,7 +330,7 @@ class ImplicitWorld:
         return found
 
     def _inertial(self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], factors: np.ndarray) -> float:
-        """Weighted sum of what integrator and solver equate to 0, drives aside: its slope in a factor is the gradient."""
+        """Weighted sum of what integrator and solver equate to 0, drives aside; a gradient is its slope in a factor."""
         m, d, product = self._inverse, self._data, np.empty(self._model.nv)
         m.opt.disableflags = self._flags
         self._scale(m, factors)
