@@ -170,7 +170,7 @@ def test_a_model_with_parts_that_have_no_gradient(parts, words):
 
 
 def test_what_else_has_no_gradient():
-    """Engine `warp`, unknown parameters and prims, forces from outside, other shapes and factors are refused by name."""
+    """Engine `warp`, unknown parameters and prims, outer forces, other shapes and factors are refused by name."""
     built = scene("football")
     physics = make_physics(built, RATE, "mujoco")
     with pytest.raises(InputError, match="engine warp has no gradient here: use engine mujoco"):
