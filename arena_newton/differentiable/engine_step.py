@@ -85,10 +85,12 @@ class EngineStep:
             factors: Factors of the model in the order of `parameters`, 1 = as built, shape [worlds, parameters].
 
         Raises:
-            InputError: A tensor of another shape.
+            InputError: A tensor of another shape, or a factor that is not above 0.
         """
         if factors is None:
             factors = torch.ones(len(self._worlds), len(self.parameters))
+        if (factors <= 0.0).any():
+            raise InputError("EngineStep: a factor of the model is not above 0")
         given = (*state, targets, factors)
         model = self._physics.mj_model
         widths = model.nq, model.nv, state.carried.shape[-1], model.nu, len(self.parameters)
