@@ -35,14 +35,15 @@ def names() -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(ByRules))
 
 
-def get(name: str) -> RuleSet:
-    """A rule set by name.
+def get(name: str, played: Sequence[str] | None = None) -> RuleSet:
+    """A rule set by name, of all tasks, or of this package's and those that a run plays, whatever else is installed.
 
     Raises:
-        InputError: Unknown name.
+        InputError: Unknown name, or an unknown task that is played.
     """
     check_name(name)
-    return _assembled(name, tasks.specs())
+    known = tasks.specs() if played is None else map(tasks.get, dict.fromkeys((*tasks.OWN, *played)))
+    return _assembled(name, tuple(known))
 
 
 @functools.lru_cache(maxsize=4)

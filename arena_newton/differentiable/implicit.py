@@ -256,9 +256,10 @@ class ImplicitWorld:
         d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
         mujoco.mj_inverse(m, d)
         mass, jacobian, (rows, columns) = self._mass_matrix(), self._jacobian(), self._rate_at
-        y = h * np.linalg.solve(mass - h * np.diag(self._damping(m)), at_v)
-        stiffness = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0)
-        w = np.linalg.solve(mass + jacobian.T @ (stiffness[:, None] * jacobian), mass @ y)
+        y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
+        stiffness, constrained = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0), np.zeros_like(mass)
+        mujoco.mju_sqrMatTD(constrained, jacobian, stiffness)
+        w = _solved(mass + constrained, mass @ y)
         damped = jacobian.T @ (stiffness * d.efc_KBIP[:, 1] * (jacobian @ w))
         mujoco.mj_implicit(m, d)  # leaves qDeriv, and takes a step that nobody needs
         at_v = at_v - damped + np.bincount(columns, d.qDeriv * w[rows], nv)
@@ -277,7 +278,7 @@ class ImplicitWorld:
         if self._sparse:
             full[np.repeat(np.arange(d.nefc), d.efc_J_rownnz), d.efc_J_colind] = d.efc_J
         else:
-            full.flat = d.efc_J
+            full[:] = d.efc_J.reshape(full.shape)
         return full
 
     def _by_position(self, step: _Substep, y: np.ndarray, w: np.ndarray, moves: np.ndarray) -> np.ndarray:
@@ -353,3 +354,11 @@ class ImplicitWorld:
             quat = qpos[q : q + 4]
             found[..., q : q + 4] = turn * tangent[..., v : v + 3] @ (_AXES @ quat) / (quat @ quat)
         return found
+
+
+def _solved(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Solution of a positive definite system, in one thread: those of LAPACK wait for each other; overwrites matrix."""
+    found = np.empty_like(vector)
+    mujoco.mju_cholFactor(matrix, 0.0)
+    mujoco.mju_cholSolve(found, matrix, vector)
+    return found

@@ -161,11 +161,13 @@ def package_files(root: Path) -> list[Path]:
 def code_files(root: Path = PACKAGE) -> list[Path]:
     """Modules of a package folder whose change may change a result: all but `UNHASHED` and command lines."""
 
-    def counts(file: Path) -> bool:
-        rooms = (part.as_posix() for part in file.relative_to(root).parents)
-        return file.suffix == ".py" and file.name != "__main__.py" and not any(room in UNHASHED for room in rooms)
+    @functools.cache
+    def counts(folder: Path) -> bool:
+        room = folder.relative_to(root)
+        return not any(part.as_posix() in UNHASHED for part in (room, *room.parents))
 
-    return [file for file in package_files(root) if counts(file)]
+    modules = (file for file in package_files(root) if file.suffix == ".py" and file.name != "__main__.py")
+    return [file for file in modules if counts(file.parent)]
 
 
 def code_hash(root: Path = PACKAGE) -> str:
