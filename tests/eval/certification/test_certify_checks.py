@@ -16,7 +16,7 @@ from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
 from arena_newton.eval.certification.finding import Score, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.pages.tables import Table
 from arena_newton.physics import batch
 from arena_newton.pictures.settings import CameraConfig

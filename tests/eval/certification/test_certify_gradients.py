@@ -11,7 +11,7 @@ from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import gradients
 from arena_newton.eval.certification.checks.gradients import Agreement, Slopes, agreement_of, flight_slopes
 from arena_newton.eval.play.env_cache import EnvCache
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 
 ESTIMATES = torch.tensor([1.0, -2.0, 0.001, 0.5, 1.5])
 
