@@ -16,6 +16,7 @@ from pathlib import Path
 
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.extras import EXTRAS
+from arena_newton.errors import InputError
 from arena_newton.files.sandboxed_load import faults
 
 __all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
@@ -236,10 +237,16 @@ def _scenes() -> list[Finding]:
 
     root = tasks.base.SCENES
     findings = []
-    for name in ("g1/g1.usda", *(f"{task}/scene.usda" for task in tasks.names())):
-        if not (root / name).is_file():
+    for path in (root / "g1" / "g1.usda", *(spec.layer for spec in tasks.specs())):
+        if not path.is_file():
+            name = path.relative_to(root) if path.is_relative_to(root) else path
             advice = "install again, or run `python -m scene_builders` in a checkout"
             findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
+    for name in {*tasks.names()} - {spec.name for spec in tasks.specs()}:
+        try:
+            tasks.get(name)
+        except InputError as error:
+            findings.append(Finding("tasks", str(error), "bad", "repair or uninstall its package"))
     return findings or [Finding("scenes", f"robot and all tasks in {root}")]
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 if TYPE_CHECKING:
     import mujoco
@@ -29,6 +29,7 @@ __all__ = [
     "EpisodeEvent",
     "EpisodeResult",
     "Judge",
+    "NEEDS",
     "Observation",
     "Physics",
     "Planned",
@@ -90,8 +91,35 @@ class Chunk:
     """Name of the phase that each world is in from this chunk on, where the policy knows phases; rows as `actions`."""
 
 
+class _Tensors:
+    """Base of records whose fields are tensors, or None where a tracker does not declare them."""
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Fields that are given, by their names; those of `ahead` with it in front, such as `ahead.joints`."""
+        found = {}
+        for name, value in vars(self).items():
+            if isinstance(value, _Tensors):
+                found |= {f"{name}.{inner}": tensor for inner, tensor in value.tensors().items()}
+            elif value is not None:
+                found[name] = value
+        return found
+
+    def mapped(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Self:
+        """The same record of changed tensors."""
+        made: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            made[name] = (
+                value.mapped(change) if isinstance(value, _Tensors) else value if value is None else change(value)
+            )
+        return type(self)(**made)
+
+
+NEEDS = ("position", "lin_vel", "foot_force")
+"""Fields of `RobotState` and `TrackerCommand` that are None, unless the tracker names them in its `needs`."""
+
+
 @dataclass
-class RobotState:
+class RobotState(_Tensors):
     """Measured robot state; rows are worlds, joints in MuJoCo order."""
 
     quat: torch.Tensor
@@ -102,10 +130,16 @@ class RobotState:
     """[rad], shape [worlds, 29]."""
     joint_vel: torch.Tensor
     """[rad/s], shape [worlds, 29]."""
+    position: torch.Tensor | None = None
+    """Root position in the world [m], shape [worlds, 3]."""
+    lin_vel: torch.Tensor | None = None
+    """Velocity of the root's origin in the world frame [m/s], shape [worlds, 3]."""
+    foot_force: torch.Tensor | None = None
+    """Norm of the net contact force on left and right foot in the last physics step [N], shape [worlds, 2]."""
 
 
 @dataclass
-class TrackerCommand:
+class TrackerCommand(_Tensors):
     """The reference of one tick; rows are worlds, joints in MuJoCo order."""
 
     mimic: torch.Tensor
@@ -116,6 +150,13 @@ class TrackerCommand:
     """Backward difference of the reference joints [rad/s], shape [worlds, 29]."""
     quat: torch.Tensor
     """Reference root orientation in the world, wxyz, shape [worlds, 4]."""
+    position: torch.Tensor | None = None
+    """Reference root position in the world [m], shape [worlds, 3]."""
+    ahead: TrackerCommand | None = None
+    """References of the next `lookahead` ticks, for trackers that declare it; fields have shape [worlds, lookahead, n].
+
+    They come from the policy's chunk. Where it ends earlier, its last reference is repeated; without any later action
+    it is the reference of this tick."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +228,8 @@ class EpisodeResult:
     """Progress as in `Verdict`."""
     events: tuple[EpisodeEvent, ...] = ()
     """Events as in `Verdict`."""
+    extra: dict[str, float] = field(default_factory=dict)
+    """Metrics of recorders by name, which `Recorder.finish` may add: finite numbers."""
 
 
 class Planned(Protocol):
@@ -206,6 +249,8 @@ class Tracker(Protocol):
     physics_rate: PhysicsRate
     fast_physics_rate: PhysicsRate
     max_root_delta_deg: float
+    needs: Sequence[str]
+    lookahead: int
 
     def rate(self, *, fast: bool = False) -> PhysicsRate:
         """Physics step and substeps per tick."""
@@ -269,6 +314,8 @@ class Physics(Protocol):
     """Body centres of mass [m], shape [worlds, nbody, 3]."""
     contact_force: wp.array
     """Norm of the net contact force on each body [N], shape [worlds, nbody]."""
+    want_forces: bool
+    """Fill `contact_force` every tick (otherwise only in worlds tilted beyond 60°, engine `mujoco`)."""
 
     @property
     def models(self) -> Sequence[mujoco.MjModel]:
@@ -283,6 +330,9 @@ class Physics(Protocol):
 
     def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
         """Add to the robot root's velocity: linear [m/s], world frame; angular [rad/s], body frame; [worlds, 6]."""
+
+    def set_dynamics(self, worlds: np.ndarray, samples: Sequence[Mapping[str, float]]) -> None:
+        """Give worlds the friction, masses and gains of samples of `modes.QUANTITIES`; an empty one, the scene's."""
 
     def set_active(self, mask: np.ndarray) -> None:
         """Worlds that `step` moves, bool, shape [worlds]; the others keep every bit of their state."""
@@ -404,7 +454,10 @@ class World(Protocol):
 
 
 class Recorder:
-    """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs."""
+    """Base of what looks on while episodes run; `rollout.Rollout` calls it, a subclass overrides what it needs.
+
+    A metric of an episode is added to `EpisodeResult.extra` in `finish`; it must not change the worlds.
+    """
 
     wants_observation: bool = False
     """True if `before_physics` needs the observation of every tick, which costs a kernel launch."""

@@ -129,6 +129,7 @@ class Rollout:
         self._stand = torch.tensor(STAND_ACTION, device=env.torch_device).expand(env.worlds, latency, ACTION_WIDTH)
         """Actions before an episode's first chunk begins, shape [worlds, latency, 40]."""
         self._rows = torch.arange(env.worlds, device=env.torch_device)
+        self._lookahead = getattr(env.tracker, "lookahead", 0)
 
     def run(self) -> list[EpisodeResult]:
         """Play all episodes.
@@ -240,11 +241,20 @@ class Rollout:
             observation = env.observe()
         for one in self.recorders:
             one.before_physics(env, observation if self._observing else None, action)
+        if self._lookahead:
+            env.loop.announce(self._coming(acting))
         status = env.step(action if self.disturbance is None else self.disturbance(env, action))
         self._next[acting] += 1
         for one in self.recorders:
             one.tick(env)
         return status
+
+    def _coming(self, acting: np.ndarray) -> torch.Tensor:
+        """Actions of every chunk behind the next one, NaN after its end, shape [worlds, lookahead, 40]."""
+        index = self._next[:, None] + np.arange(1, self._lookahead + 1)
+        real = torch.from_numpy(acting[:, None] & (index < self._length[:, None])).to(self.env.torch_device)
+        ticks = torch.from_numpy(np.minimum(index, self._chunk.shape[1] - 1)).to(self.env.torch_device)
+        return torch.where(real[..., None], self._chunk[self._rows[:, None], ticks], torch.nan)
 
     def _endings(self, status: np.ndarray) -> list[int]:
         """Finish the episodes that a tick ended; returns their worlds."""

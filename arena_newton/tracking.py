@@ -12,7 +12,7 @@ Tasks, rules and episodes are unknown here, and the physics step is the caller's
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,10 +20,11 @@ import torch
 import warp as wp
 
 from arena_newton.errors import InputError
-from arena_newton.interfaces import RobotState, TrackerCommand
+from arena_newton.interfaces import NEEDS, RobotState, TrackerCommand
 from arena_newton.kernels import canonical
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
+from arena_newton.physics.dynamics import Delay, value_of
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
@@ -120,13 +121,43 @@ class TrackerLoop:
             joint_pos=joints(),
             joint_vel=joints(),
         )
-        """Robot of the last tick, as the tracker got it; the root's numbers are live views of the physics."""
+        """Robot of the last tick, as a tracker gets it without latency; the root's numbers are live views of the
+        physics."""
+        self._late: tuple[Delay, Delay] | None = None
+        """Latencies of the tracker's state and of the joint targets; None until a world has one."""
+        self.lookahead: int = getattr(tracker, "lookahead", 0)
+        """Coming references that the tracker reads [ticks]."""
+        self._give(getattr(tracker, "needs", ()))
         self._prefill = np.zeros(self.worlds, dtype=bool)
         self._ticking = WorldMask(self.worlds, self.device)
         self._chosen = WorldMask(self.worlds, self.device)
         self._integrate, self._drive = record(self._launch_integrate), record(self._launch_drive)
         self._takes_mask = "mask" in inspect.signature(tracker.step).parameters
         tracker.bind(self.worlds, self.torch_device)
+
+    def _give(self, needs: Sequence[str]) -> None:
+        """Give the tracker the further fields that it declares; all but the window are live views."""
+        command, state, robot = self.command, self.state, self.robot
+        for name in set(needs) - set(NEEDS):
+            raise InputError(f"tracker {self.tracker.name}: needs {name!r}; known are {', '.join(NEEDS)}")
+        if "position" in needs:
+            command.position = wp.to_torch(self.reference.position)
+            state.position = self._qpos[:, robot.root_qpos : robot.root_qpos + 3]
+        if "lin_vel" in needs:
+            state.lin_vel = self._qvel[:, robot.root_qvel : robot.root_qvel + 3]
+        if "foot_force" in needs:
+            self.physics.want_forces = True
+            left, right = robot.feet
+            state.foot_force = wp.to_torch(self.physics.contact_force)[:, left : right + 1 : right - left]
+        if not self.lookahead:
+            return
+        command.ahead = command.mapped(lambda t: t.new_zeros(self.worlds, self.lookahead, t.shape[1]))
+        self._announced: torch.Tensor | None = None
+        self._later = canonical.ReferencePose.allocate(
+            self.worlds, self.device, canonical_to_mujoco=g1.CANONICAL_TO_MUJOCO, tick=g1.TICK
+        )
+        self._later_action = wp.zeros_like(self._action)
+        self._later_bad, self._later_mask = (wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in "bm")
 
     def _ints(self, values: np.ndarray) -> wp.array:
         return wp.array(np.asarray(values, dtype=np.int32), dtype=wp.int32, device=self.device)
@@ -166,6 +197,75 @@ class TrackerLoop:
         """
         self.tracker.reset(self._chosen.choose(mask).torch)
         self._prefill[mask] = prefill
+        for late in self._late or ():
+            late.forget(self._chosen.torch)
+
+    def delay(self, worlds: np.ndarray, samples: Sequence[Mapping[str, float]]) -> None:
+        """Give worlds the latencies of samples of the dynamics, at their reset before `fresh`.
+
+        The tracker gets the state as it was `state_latency` ticks ago, and its joint targets reach the actuators
+        `action_latency` ticks later; hands open and close at once.
+
+        Args:
+            worlds: World indices.
+            samples: Values of `modes.QUANTITIES`, one mapping per world.
+        """
+        if self._late is None:
+            if not any(samples):
+                return
+            width = sum(part.shape[1] for part in self.state.tensors().values())
+            self._late = Delay(self.worlds, width, self.torch_device), Delay(self.worlds, JOINTS, self.torch_device)
+        for late, name in zip(self._late, ("state_latency", "action_latency"), strict=True):
+            ticks = [int(value_of(sample, name)) for sample in samples]
+            late.ticks[torch.from_numpy(worlds).to(self.torch_device)] = torch.tensor(ticks, device=self.torch_device)
+
+    def _late_state(self, mask: torch.Tensor) -> RobotState:
+        """Robot as its latency lets the tracker see it."""
+        if self._late is None:
+            return self.state
+        parts = self.state.tensors()
+        now = torch.cat([*parts.values()], 1)
+        late = self._late[0].late(now).split([part.shape[1] for part in parts.values()], 1)
+        self._late[0].keep(now, mask)
+        return RobotState(**dict(zip(parts, late, strict=True)))
+
+    def announce(self, coming: torch.Tensor) -> None:
+        """Take the actions that follow the next tick's, for a tracker with a lookahead; they count for that tick alone.
+
+        Args:
+            coming: Canonical actions, shape [worlds, n, 40]. From a row's first action on that cannot be executed, such
+                as NaN, the last reference before it is repeated, as it is after n; all are without an announcement.
+        """
+        self._announced = coming
+
+    def _look_ahead(self) -> None:
+        """Integrate the announced actions into the window of coming references, which the reference itself ignores."""
+        command, window = self.command, self.command.ahead
+        assert window is not None
+        now = {name: tensor for name, tensor in command.tensors().items() if not name.startswith("ahead.")}
+        for name, tensor in now.items():
+            getattr(window, name).copy_(tensor[:, None].expand(-1, self.lookahead, -1))
+        coming, self._announced = self._announced, None
+        if coming is None or not coming.shape[1]:
+            return
+        later, turn = self._later, self.tracker.max_root_delta_deg
+        for name, array in vars(self.reference).items():
+            if isinstance(array, wp.array):
+                wp.copy(getattr(later, name), array)
+        self._later_mask.fill_(1)
+        mask, bad, action = (wp.to_torch(a) for a in (self._later_mask, self._later_bad, self._later_action))
+        whole = {name: wp.to_torch(getattr(later, name)) for name in now}
+        count = min(self.lookahead, coming.shape[1])
+        for k in range(count):
+            action.copy_(coming[:, k])
+            canonical.launch_validate_action(self._later_action, self._later_bad)
+            mask.mul_(bad == 0)
+            canonical.launch_integrate(later, self._later_action, self._later_mask, turn)
+            for name, tensor in whole.items():
+                canonical_order = name in ("joints", "joint_vel")
+                getattr(window, name)[:, k] = tensor[:, self._to_mujoco] if canonical_order else tensor
+        for tensor in window.tensors().values():
+            tensor[:, count:] = tensor[:, count - 1 : count]
 
     def tick(self, action: torch.Tensor, mask: np.ndarray) -> torch.Tensor:
         """Turn one action per world into actuator targets; the physics moves on the caller's `physics.step()`.
@@ -190,6 +290,9 @@ class TrackerLoop:
         torch.index_select(self._ref_vel, 1, self._to_mujoco, out=command.joint_vel)
         torch.index_select(self._qpos, 1, self._joint_qpos, out=state.joint_pos)
         torch.index_select(self._qvel, 1, self._joint_qvel, out=state.joint_vel)
+        if self.lookahead:
+            self._look_ahead()
+        state = self._late_state(ticking)
         first = self._prefill & mask
         if first.any():
             self.tracker.prefill(command, state, self._chosen.choose(first).torch)
@@ -200,6 +303,10 @@ class TrackerLoop:
             self._take(self.tracker.step(command, state, ticking), ticking)
         else:
             self._take(self.tracker.step(command, state), ticking)
+        if self._late is not None:
+            targets = self._late[1].late(self.targets)
+            self._late[1].keep(self.targets, ticking)
+            torch.where(ticking[:, None], targets, self.targets, out=self.targets)
         self._drive()
         return self.targets
 

@@ -26,16 +26,20 @@ READING = {
     "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
     "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
         docs/design/identity""",
-    "How-to": """docs/policies docs/serving docs/trackers docs/authoring docs/experts docs/recording docs/datasets
-        docs/curation docs/training docs/suites docs/machines docs/comparing docs/sensitivity docs/auditing
-        docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients docs/api examples/index""",
+    "How-to": """docs/policies docs/serving docs/asking_servers docs/trackers docs/authoring docs/experts docs/recording
+        docs/datasets docs/curation docs/training docs/training_policies docs/recipes docs/loop docs/suites
+        docs/machines docs/comparing docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym
+        docs/motions docs/gradients docs/api examples/index""",
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
-    "Results": """docs/results/README docs/results/findings docs/results/reproductions
-        policies/weights/learned/card eval/tables/paper/README docs/certificate docs/performance""",
+    "Results": """docs/results/README docs/results/findings docs/results/reproductions docs/results/trainings
+        docs/results/demonstrations docs/results/failure_labels policies/weights/learned/card
+        eval/tables/paper/README docs/performance docs/results/certificate/certify
+        docs/results/certificate/certify_1 docs/results/certificate/certify_2 docs/results/certificate/certify_3
+        docs/results/certificate/certify_4""",
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
-EXAMPLES = """first_episode own_policy own_tracker drive_by_code usd_variant record_and_build swap aim_a_kick
+EXAMPLES = """first_episode own_policy own_tracker own_mode drive_by_code usd_variant record_and_build swap aim_a_kick
     refine_reference compare_runs""".split()
 CONFIGURATION = {
     "project": PROJECT["name"],

@@ -128,6 +128,7 @@ POLICIES: Registry[Policy] = Registry(
         "expert": "arena_newton.policies.experts:from_spec",
         "learned": "arena_newton.policies.learned.learned_policy:from_spec",
         "lerobot": "arena_newton.policies.lerobot.checkpoint_policy:from_spec",
+        "process": "arena_newton.policies.remote.process_client:ProcessPolicy",
         "remote": "arena_newton.policies.remote.arena_client:from_spec",
         "replay": "arena_newton.policies.replay:from_spec",
         "stand": "arena_newton.policies.stand:from_spec",

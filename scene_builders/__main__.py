@@ -34,7 +34,7 @@ class LayerOptions:
 
 def parts() -> tuple[str, ...]:
     """Parts that can be built, in order; without tasks that bring their own layer."""
-    return ("textures", "patterns", "g1", *(name for name in tasks.names() if tasks.get(name).scene is None), "lab")
+    return ("textures", "patterns", "g1", *tasks.OWN, "lab")
 
 
 def build_all(folder: Path = SCENES, names: Sequence[str] = ()) -> list[Path]:

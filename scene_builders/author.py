@@ -11,6 +11,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
+from arena_newton.usd_scenes.dependencies import PACKAGE, search_context
 
 Vec = Sequence[float] | np.ndarray
 """A vector or quaternion, of Python or NumPy numbers."""
@@ -23,7 +24,7 @@ def new_stage(path: Path, default_prim: str = "/World", *, scene: bool = True) -
     layer = Sdf.Layer.FindOrOpen(str(path)) if path.exists() else None
     if layer is not None:
         layer.Clear()
-    stage = Usd.Stage.Open(layer) if layer is not None else Usd.Stage.CreateNew(str(path))
+    stage = Usd.Stage.Open(layer, search_context()) if layer else Usd.Stage.CreateNew(str(path), search_context())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
@@ -34,6 +35,24 @@ def new_stage(path: Path, default_prim: str = "/World", *, scene: bool = True) -
         physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
         physics.CreateGravityMagnitudeAttr(9.81)
     return stage
+
+
+def asset(stage: Usd.Stage, path: str) -> str:
+    """Asset path of another part of `usd_scenes`, such as `../g1/g1.usda`, for the layer of a stage.
+
+    It stays relative where the part is there; elsewhere, as from a task's own package, it is found by the search path.
+    """
+    beside = Path(stage.GetRootLayer().realPath).parent / path
+    return path if beside.is_file() else PACKAGE + path.rpartition("../")[2]
+
+
+def look_at(eye: Vec, point: Vec) -> tuple[float, float, float, float]:
+    """Orientation of a camera at `eye` [m] that looks at a point [m] with its upper edge up; wxyz."""
+    z = np.subtract(eye, point) / np.linalg.norm(np.subtract(eye, point))
+    x = np.cross((0.0, 0.0, 1.0), z)
+    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    quat = Gf.Matrix3d(*map(float, np.concatenate([x, np.cross(z, x), z]))).ExtractRotation().GetQuat()
+    return (quat.GetReal(), *quat.GetImaginary())
 
 
 def attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName) -> Usd.Attribute:
@@ -264,7 +283,7 @@ def material(
     metallic: float = 0.0,
     texture: str | None = None,
 ) -> Usd.Prim:
-    """A UsdPreviewSurface look; `texture` is an asset path relative to the layer and replaces the colour."""
+    """A UsdPreviewSurface look; `texture` is a path as of `asset` and replaces the colour."""
     look = UsdShade.Material.Define(stage, path)
     shader = UsdShade.Shader.Define(stage, f"{path}/Surface")
     shader.CreateIdAttr("UsdPreviewSurface")
@@ -275,7 +294,7 @@ def material(
     if texture is not None:
         image = UsdShade.Shader.Define(stage, f"{path}/Texture")
         image.CreateIdAttr("UsdUVTexture")
-        image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(texture))
+        image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(asset(stage, texture)))
         image.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("repeat")
         image.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("repeat")
         reader = UsdShade.Shader.Define(stage, f"{path}/St")

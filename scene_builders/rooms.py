@@ -54,7 +54,7 @@ def scene_stage(folder: Path, spawn: Vec, facing: Vec, *, eye: Vec, gaze: Vec, v
     """
     stage = author.new_stage(folder / "scene.usda")
     robot = author.xform(stage, "/World/Robot", spawn, facing)
-    robot.GetReferences().AddReference("../g1/g1.usda")
+    robot.GetReferences().AddReference(author.asset(stage, "../g1/g1.usda"))
     # 1920×1080, focal 12, aperture 27: horizontal field of view 96.7° (the original's world camera).
     author.camera(stage, "/World/WorldCamera", eye, gaze, focal=12.0, aperture=27.0, size=(1920, 1080))
     author.dome_light(stage)

@@ -2,9 +2,10 @@
 
 import gc
 import os
+import shutil
 import signal
 import sys
-import tomllib
+import zipfile
 from pathlib import Path
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -129,17 +130,44 @@ def football_warp():
     return load_scene("football", worlds=2, device="cpu", rules=rule_sets.get("paper"))
 
 
+def install(package: Path, folder: Path) -> Path:
+    """The folder of site packages into which the wheel of a package is unpacked, as an installer does it."""
+    from hatchling.builders.wheel import WheelBuilder
+
+    wheel = next(WheelBuilder(str(package)).build(directory=str(folder), versions=["standard"]))
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(folder / "site-packages")
+    return folder / "site-packages"
+
+
 @pytest.fixture
 def installed_falcon(tmp_path, monkeypatch):
     """The example package of a tracker as an installer leaves it: importable, with its entry points."""
-    package = ROOT / "tests" / "trackers" / "falcon_package"
-    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
-    info = tmp_path / "falcon_tracker-1.0.dist-info"
-    info.mkdir()
-    info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: falcon-tracker\nVersion: 1.0\n")
-    lines = [f"[{g}]\n" + "".join(f"{k} = {v}\n" for k, v in e.items()) for g, e in project["entry-points"].items()]
-    info.joinpath("entry_points.txt").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(package)
-    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend(install(ROOT / "tests" / "trackers" / "falcon_package", tmp_path))
     yield
     sys.modules.pop("falcon_tracker", None)
+
+
+@pytest.fixture
+def installed_homing(tmp_path, monkeypatch):
+    """The example package of a tracker with state estimation and a window, as an installer leaves it."""
+    monkeypatch.syspath_prepend(install(ROOT / "examples" / "new_tracker", tmp_path))
+    yield
+    sys.modules.pop("homing_tracker", None)
+
+
+@pytest.fixture(scope="session")
+def push_bin_site(tmp_path_factory):
+    """Site packages with the example package of a task."""
+    return install(ROOT / "examples" / "new_task", tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture
+def push_bin(push_bin_site, tmp_path, monkeypatch):
+    """Folder of the example package of a task, a copy that a test may change, as an installer leaves it."""
+    site = tmp_path / "site-packages"
+    shutil.copytree(push_bin_site, site)
+    monkeypatch.syspath_prepend(site)
+    yield site / "push_bin"
+    for name in [name for name in sys.modules if name.partition(".")[0] == "push_bin"]:
+        del sys.modules[name]

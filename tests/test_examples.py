@@ -1,6 +1,7 @@
 """The examples: each runs, says what it shows, is short, and prints what its page promises."""
 
 import ast
+import contextlib
 import importlib.util
 import re
 import runpy
@@ -15,15 +16,20 @@ from arena_newton.cli.extras import EXTRAS
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
+RUN = "--task boxing --tracker twist2 --seeds 0 --repeats 1 --engine mujoco --max-steps 4 --out OUT".split()
 SHORT: dict[str, list[str]] = {
     "aim_a_kick": ["--kick", "7.34", "6.03", "--max-steps", "20"],
     "compare_runs": ["--max-steps", "4", "--out", "OUT"],
     "drive_by_code": ["--max-steps", "55"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
+    "own_metric": [*RUN, "--policy", "stand"],
+    "own_mode": ["--max-steps", "4"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
+    "process_policy": ["--max-steps", "15", "--out", "OUT"],
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "refine_reference": ["--max-steps", "4", "--rounds", "2"],
+    "research": [*RUN, "--policy", "stand"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
     "usd_variant": ["--max-steps", "4", "--out", "OUT"],
 }
@@ -33,10 +39,14 @@ SAYS = {
     "compare_runs": r"expert: 0 of 4, 0 that the other loses\n.*stand: 0 of 4.*\nprobability .* by luck: 1\n",
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
+    "own_metric": r"boxing \| twist2  \| stand  \| base \| highest_speed \| 1 \| 0\.\d+ ± 0 \| 0\.\d+ to 0\.\d+ \|\n",
+    "own_mode": r"(football/wet/s0/r\d: timeout after 0.1 s\n){2}",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
+    "process_policy": r"policy process:python process_policy.py answer, (.*\n)*2 episodes, this run took",
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
+    "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
@@ -77,7 +87,8 @@ def test_example_runs(path, tmp_path, monkeypatch, capsys):
     flags = [str(tmp_path / "out") if flag == "OUT" else flag for flag in SHORT[path.stem]]
     monkeypatch.setattr(sys, "argv", [str(path), *flags])
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(path), run_name="__main__")
+    with contextlib.suppress(SystemExit):
+        runpy.run_path(str(path), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(SAYS[path.stem], printed), printed
     if "OUT" in SHORT[path.stem]:

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
 from arena_newton.eval.records.identity import UNHASHED
-from arena_newton.rules.rule_types import HELD_OUT, MODES
+from arena_newton.rules.modes import BUILT_IN, HELD_OUT
 from arena_newton.trackers.interface import MODULES
 from tests.import_graph import (
     INNER,
@@ -75,8 +75,8 @@ ANY = {
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 LISTED = {
     "task": (tasks.PAPER, {"arena_newton/tasks/__init__.py"}, 5),
-    "mode": (tuple(mode for mode in MODES if mode not in HELD_OUT), {"arena_newton/rules/rule_types.py"}, 2),
-    "held-out look": (HELD_OUT, {"arena_newton/rules/rule_types.py", "scene_builders/patterns.py"}, 2),
+    "mode": (tuple(mode for mode in BUILT_IN if mode not in HELD_OUT), {"arena_newton/rules/modes.py"}, 2),
+    "held-out look": (HELD_OUT, {"arena_newton/rules/modes.py", "scene_builders/patterns.py"}, 2),
     "tracker": (tuple(MODULES), {"trackers/interface.py"}, 3),
     "channel of motion commands": (
         "trackers/motions/commands.py:MotionCommand",
@@ -97,10 +97,7 @@ OF_THE_PAPER = {
     "arena_newton/data/recording/layouts.py": "trackers that the original's datasets name",
     "eval/certification/certify_options.py": "trackers that are certified when none is named",
     "eval/certification/checks/failures.py": "seeds on which thresholds were set",
-    "eval/certification/checks/legs.py": "tasks of the paper that a gliding base solves, and why",
     "eval/certification/checks/rule_ticks.py": "the paper's rules, held to a second implementation",
-    "eval/certification/checks/visible.py": "targets of the paper's tasks",
-    "eval/plan/interaction.py": "what the paper's tasks touch; a task without a row is refused --failures by name",
     "eval/plan/options.py": "trackers of the default run",
     "eval/studies/action_map.py": "the paper's colours",
     "eval/tables/paper_claims.py": "the paper's claims",

@@ -32,7 +32,8 @@ __all__ = [
 ]
 
 ENTRY_POINT_GROUP = "arena_newton.trackers"
-"""Other packages offer trackers under this entry point group: a callable that takes `checkpoint: Path | None`."""
+"""Other packages offer trackers under this entry point group: a callable that takes `checkpoint: Path | None` and,
+where the tracker has variants (`--tracker name:argument`), the argument as a text."""
 
 
 class Tracker:
@@ -58,6 +59,10 @@ class Tracker:
     """Parts of the 40-number action that cannot reach the robot through this tracker."""
     max_root_delta_deg: float = 0.0
     """Largest turn of the reference root between ticks [deg], 0 = no limit (the original limits SONIC's to 26)."""
+    needs: Sequence[str] = ()
+    """Fields of `interfaces.NEEDS` that this tracker reads; it gets None for the others."""
+    lookahead: int = 0
+    """Ticks after this one whose reference it reads in `TrackerCommand.ahead`."""
     worlds: int = 0
     """Worlds this tracker is bound to."""
 
@@ -98,20 +103,21 @@ class Tracker:
 
     def describe(self) -> dict[str, Any]:
         """Facts to record with every result to name this tracker exactly; drive and rate are the environment's."""
-        return {"name": self.name, "checkpoint_hash": self.checkpoint_hash, "ignores": list(self.ignores)}
+        window = {"lookahead": self.lookahead} if self.lookahead else {}
+        return {"name": self.name, "checkpoint_hash": self.checkpoint_hash, "ignores": list(self.ignores), **window}
 
 
 _TRACKERS: Registry[Tracker] = Registry(
     "tracker",
     ENTRY_POINT_GROUP,
     lambda: Tracker,
-    {"pd": "arena_newton.trackers.pd:from_checkpoint"}
+    {name: f"arena_newton.trackers.{name}:from_checkpoint" for name in ("mjlab", "pd")}
     | {name: f"{module}:from_checkpoint" for name, module in interface.MODULES.items()},
 )
 
 
-def register(name: str, factory: Callable[[Path | None], Tracker]) -> None:
-    """Offer a tracker under `name` in this process; `factory` takes the checkpoint's path or None.
+def register(name: str, factory: Callable[..., Tracker]) -> None:
+    """Offer a tracker under `name` in this process; `factory` takes what an entry point's does.
 
     Raises:
         InputError: A built-in tracker has that name.
@@ -141,19 +147,25 @@ def check_spec(spec: str) -> None:
     Raises:
         InputError: Unknown name, or a name that is offered twice.
     """
-    _TRACKERS.check(spec)
+    _TRACKERS.check(_split(spec)[0])
 
 
 def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:
-    """Make a built-in, registered or entry-point tracker by name.
+    """Make a built-in, registered or entry-point tracker from `name` or `name:argument`, such as `sonic:v1_1`.
 
     A checkpoint is a file, or whatever path the tracker documents; without one a tracker takes its own weights.
 
     Raises:
-        InputError: Unknown name, or a checkpoint that is absent or unfit.
+        InputError: Unknown name, an argument that the tracker does not take, or a checkpoint that is absent or unfit.
     """
-    _TRACKERS.check(spec)
+    check_spec(spec)
+    name, *argument = _split(spec)
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and not all(Path(part).exists() for part in str(path).split(",")) and not path.exists():
         raise InputError(f"--checkpoint {path}: no such file")
-    return _TRACKERS.make(spec, path)
+    return _TRACKERS.make(name, path, *argument)
+
+
+def _split(spec: str) -> list[str]:
+    """Name and, where there is one, argument of a tracker; names that were registered may have a colon themselves."""
+    return [spec] if spec in _TRACKERS.names() else spec.split(":", 1)

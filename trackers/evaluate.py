@@ -54,10 +54,10 @@ class Entry:
 
     def make(self) -> Tracker:
         """A new tracker, not bound yet."""
-        from arena_newton.trackers.base import get, register
+        from arena_newton.trackers.base import get, names, register
 
         module, _, factory = self.name.partition(":")
-        if factory:
+        if factory and module not in names():
             try:
                 register(self.name, getattr(importlib.import_module(module), factory))
             except (ImportError, AttributeError) as error:
@@ -85,7 +85,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog=PROG, description="Measure trackers on one suite of references.")
     add = parser.add_argument
-    name = "registered tracker, or module:factory of one that is not; repeat to compare several"
+    name = "tracker or tracker:argument, or module:factory of one that is not known; repeat to compare several"
     add("--tracker", dest="trackers", action=_AddTracker, metavar="NAME", help=name)
     add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
     add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")

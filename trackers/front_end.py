@@ -106,6 +106,10 @@ class FrontEnd(abc.ABC):
     """Width of the raw action."""
     default_pose: tuple[float, ...] = (0.0,) * JOINTS
     """Pose that measured joints are taken relative to [rad], MuJoCo order."""
+    needs: Sequence[str] = ()
+    """Fields of `interfaces.NEEDS` that it reads."""
+    lookahead: int = 0
+    """Coming references that it reads [ticks]."""
     graphable: bool = False
     """True if a tick on CUDA is the same operations on the same buffers each time, so that a CUDA graph may hold it."""
 
@@ -215,6 +219,7 @@ class NetworkTracker(Tracker):
     ):
         """Join a front end and a network, which maps [rows, obs_width] to [rows, action_width], each row by itself."""
         self.front_end = front_end
+        self.needs, self.lookahead = front_end.needs, front_end.lookahead
         self.network = network
         self.checkpoint, self.checkpoint_hash = checkpoint, checkpoint_hash
 
@@ -361,25 +366,21 @@ class _TickGraph:
     """A tick held in a CUDA graph: some sixty small launches become one; ticks with a mask have a second graph."""
 
     def __init__(self, tick: Tick, worlds: int, device: torch.device):
-        """Allocate the inputs that the graphs read; `tick` must always write the same result buffer."""
+        """Keep the tick, whose first call shows which inputs there are; it must always write the same result buffer."""
         self._tick = tick
-
-        def row(width: int) -> torch.Tensor:
-            return torch.zeros(worlds, width, device=device)
-
-        self._command = TrackerCommand(mimic=row(35), joints=row(JOINTS), joint_vel=row(JOINTS), quat=row(4))
-        self._state = RobotState(quat=row(4), ang_vel_body=row(3), joint_pos=row(JOINTS), joint_vel=row(JOINTS))
-        self._inputs = [*vars(self._command).values(), *vars(self._state).values()]
+        self._command: TrackerCommand
+        self._state: RobotState
+        self._inputs: list[torch.Tensor] = []
         self._mask = torch.ones(worlds, dtype=torch.bool, device=device)
         self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, torch.Tensor]] = {}
-        self._warm = False
 
     def __call__(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None) -> torch.Tensor:
         """One tick; the first runs as it is, which makes libraries allocate what they need."""
-        if not self._warm:
-            self._warm = True
+        if not self._inputs:
+            self._command, self._state = command.mapped(torch.empty_like), state.mapped(torch.empty_like)
+            self._inputs = [*self._command.tensors().values(), *self._state.tensors().values()]
             return self._tick(command, state, mask)
-        torch._foreach_copy_(self._inputs, [*vars(command).values(), *vars(state).values()])
+        torch._foreach_copy_(self._inputs, [*command.tensors().values(), *state.tensors().values()])
         masked = mask is not None
         if mask is not None:
             self._mask.copy_(mask)

@@ -1,7 +1,7 @@
 """Interfaces that are trained here: one record per tracker, from which training, weights files and bars are derived.
 
-A module such as `twist2` ends with its record, `INTERFACE`, and is listed in `MODULES`. Nothing here imports torch, so
-that command lines can list the names.
+A module such as `twist2` ends with its record, `INTERFACE`, and is listed in `MODULES`; another package offers its own
+under the entry point group `arena_newton.interfaces`. Nothing here imports torch, so that command lines can list names.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from arena_newton.cli.registry import Registry
 from arena_newton.errors import InputError
 from arena_newton.robot.g1 import MUJOCO_JOINTS, DriveGains, PhysicsRate
 
@@ -26,6 +27,8 @@ MODULES: dict[str, str] = {"sonic": "arena_newton.trackers.sonic", "twist2": "ar
 """Interface → module with its `INTERFACE`, and with `from_checkpoint`, which makes the tracker."""
 
 JOINTS = len(MUJOCO_JOINTS)
+_OFFERED: Registry[Interface] = Registry("tracker", "arena_newton.interfaces", lambda: Interface, MODULES)
+"""Interfaces of other packages, under the entry point group: a callable without arguments that makes the record."""
 
 _WIDEST = 8192
 """Widest layer that a file may ask for."""
@@ -115,15 +118,17 @@ class Interface:
 
 def names() -> tuple[str, ...]:
     """Names of the interfaces, sorted."""
-    return tuple(sorted(MODULES))
+    return _OFFERED.names()
 
 
 def get(name: str) -> Interface:
     """An interface by name.
 
     Raises:
-        InputError: Unknown name.
+        InputError: Unknown name, a name that is offered twice, or a package that does not load.
     """
-    if name not in MODULES:
+    if name not in names():
         raise InputError(f"interface {name!r}: unknown; trained here are {', '.join(names())}")
-    return importlib.import_module(MODULES[name]).INTERFACE
+    if name in MODULES and not _OFFERED.points(name):
+        return importlib.import_module(MODULES[name]).INTERFACE
+    return _OFFERED.make(name)

@@ -4,12 +4,16 @@ Facts are those of the released controller as the original benchmark drives it (
 takes 1762 numbers of which mode 0 fills the joint positions, the joint velocities and the orientation anchor; there is
 no look-ahead, the current frame is repeated ten times. Inside, joints are in canonical order. The elementwise
 arithmetic is exactly rounded, so a world's bits do not depend on the other worlds.
+
+The three releases as NVIDIA drives them, with a window of coming references, are `VARIANTS`: layouts and steps are
+those of `observation_config*.yaml` in NVlabs/GR00T-WholeBodyControl (commit 1983e88, mode `g1`).
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +23,7 @@ from torch import nn
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
+from arena_newton.robot.rotations import heading_quat
 from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store, without_gradients
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last
@@ -34,6 +39,8 @@ __all__ = [
     "SonicFrontEnd",
     "SonicNet",
     "SonicTracker",
+    "VARIANTS",
+    "Variant",
     "from_checkpoint",
     "official_pair",
 ]
@@ -68,6 +75,33 @@ LATENT = 64
 """Width of the latent."""
 ENCODED = ("ref_pos", "ref_vel", "anchor", "anchors")
 """Parts that the encoder reads in the joint-reference mode."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Encoder input of a release, and what of the reference it shows."""
+
+    layout: Mapping[str, int]
+    """Parts in order → their widths; what the joint-reference mode does not read stays zero."""
+    step: int = 0
+    """Ticks from frame to frame of the window; 0: the reference of this tick in all frames."""
+    heading: bool = False
+    """Anchors are relative to the robot's heading instead of its whole orientation."""
+
+    @property
+    def lookahead(self) -> int:
+        """Ticks from the first frame to the last."""
+        return self.step * (FRAMES - 1)
+
+
+_WINDOW = {"mode": 4, "ref_pos": FRAMES * JOINTS, "ref_vel": FRAMES * JOINTS, "anchors": FRAMES * 6, "anchor": 6}
+VARIANTS: Mapping[str, Variant] = {
+    "": Variant(ENCODER_LAYOUT),
+    "default": Variant(ENCODER_LAYOUT, step=5),
+    "low_latency": Variant(_WINDOW | {"other_modes": 597}, step=1),
+    "v1_1": Variant(_WINDOW | {"other_modes": 1101}, step=5, heading=True),
+}
+"""`--tracker sonic:<variant>` → encoder input; the one without a name is the original benchmark's."""
 _ONE_FRAME = tuple(
     slice(AT[name].start, AT[name].start + width)
     for name, width in {"ref_pos": JOINTS, "ref_vel": JOINTS, "anchor": 6}.items()
@@ -207,15 +241,18 @@ class _DeployedSonic(PartialNetwork):
 
 
 class SonicFrontEnd(FrontEnd):
-    """Encoder input (1762), then proprioception (930)."""
+    """Encoder input (1762 without a variant), then proprioception (930)."""
 
     obs_width = OBSERVATION
     default_pose = SONIC_DEFAULT_POSE
     graphable = True
 
-    def __init__(self, action_form: ActionForm = SONIC_FORM):
-        """Take SONIC's action form or another."""
+    def __init__(self, action_form: ActionForm = SONIC_FORM, variant: Variant = VARIANTS[""]):
+        """Take SONIC's action form or another, and the encoder input."""
         super().__init__(action_form)
+        self.variant, self.lookahead = variant, variant.lookahead
+        self.encoder_width = sum(variant.layout.values())
+        self.obs_width = self.encoder_width + PROPRIOCEPTION
 
     def bind(self, worlds: int, device: torch.device | str = "cpu", obs: torch.Tensor | None = None) -> None:
         """Allocate buffers for `worlds` worlds on `device`."""
@@ -225,23 +262,27 @@ class SonicFrontEnd(FrontEnd):
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
         self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, width=8, device=self.device)
         self._rot6d = Quadratic(ROT6D, IDENTITY_6D, device=self.device)
+        at = slices(self.variant.layout | PROPRIOCEPTION_LAYOUT)
+        if self.lookahead:
+            self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], width=8, device=self.device)
+            self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
 
         def frames(name: str) -> torch.Tensor:
-            return self.obs[:, AT[name]].view(worlds, FRAMES, -1)
+            return self.obs[:, at[name]].view(worlds, FRAMES, -1)
 
         self._ref_pos, self._ref_vel, self._anchors = frames("ref_pos"), frames("ref_vel"), frames("anchors")
         self._ang_vel, self._gravity = frames("ang_vel"), frames("gravity")
         self._joint_pos, self._joint_vel, self._actions = frames("joint_pos"), frames("joint_vel"), frames("actions")
-        self._anchor = self.obs[:, None, AT["anchor"]]
+        self._anchor = self.obs[:, None, at["anchor"]]
         self._now_ang_vel, self._now_gravity = self._ang_vel[:, -1], self._gravity[:, -1]
         self._now_joint_pos, self._now_joint_vel = self._joint_pos[:, -1:], self._joint_vel[:, -1:]
         self._now_action = self._actions[:, -1]
-        self._proprio = self.obs[:, ENCODER_INPUT:]
+        self._proprio = self.obs[:, self.encoder_width :]
         # Column from which each column of the histories takes its value when a tick ends; the newest stay.
         source = []
         for name, size in PROPRIOCEPTION_LAYOUT.items():
             newest = size - size // FRAMES
-            first = AT[name].start - ENCODER_INPUT
+            first = at[name].start - self.encoder_width
             source += [first + (i if i >= newest else i + size // FRAMES) for i in range(size)]
         self._source = torch.tensor(source, device=self.device)
         self._first_tick = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
@@ -280,13 +321,16 @@ class SonicFrontEnd(FrontEnd):
         """Write reference, anchor and the newest entry of each history but the actions'."""
         joints = torch.cat((command.joints, command.joint_vel, state.joint_pos - self._default, state.joint_vel), 1)
         ref_pos, ref_vel, pos, vel = joints.index_select(1, self._four_to_canonical).view(-1, 4, 1, JOINTS).unbind(1)
-        self._ref_pos.copy_(ref_pos.expand_as(self._ref_pos))
-        self._ref_vel.copy_(ref_vel.expand_as(self._ref_vel))
         quats = torch.cat((state.quat, command.quat), 1)
         relative, down = self._relative_and_down(state.quat, quats).split((4, 3), 1)
-        anchor = self._rot6d(relative, relative)[:, None]
-        self._anchor.copy_(anchor)
-        self._anchors.copy_(anchor.expand_as(self._anchors))
+        if self.lookahead:
+            self._write_window(command, state)
+        else:
+            self._ref_pos.copy_(ref_pos.expand_as(self._ref_pos))
+            self._ref_vel.copy_(ref_vel.expand_as(self._ref_vel))
+            anchor = self._rot6d(relative, relative)[:, None]
+            self._anchor.copy_(anchor)
+            self._anchors.copy_(anchor.expand_as(self._anchors))
         self._now_gravity.copy_(down)
         self._now_ang_vel.copy_(state.ang_vel_body)
         self._now_joint_pos.copy_(pos)
@@ -295,6 +339,25 @@ class SonicFrontEnd(FrontEnd):
             first = self._first_tick.clone()  # `advance` changes it, a gradient needs it
             self._joint_pos.copy_(torch.where(first, pos, self._joint_pos))
             self._joint_vel.copy_(torch.where(first, vel, self._joint_vel))
+
+    def _write_window(self, command: TrackerCommand, state: RobotState) -> None:
+        """Write this tick's reference and the coming ones that the window shows; `anchor` is another mode's."""
+        ahead, step = command.ahead, self.variant.step
+        assert ahead is not None
+        joints, vel, quats = (
+            torch.cat((now[:, None], later[:, step - 1 :: step]), 1)
+            for now, later in (
+                (command.joints, ahead.joints),
+                (command.joint_vel, ahead.joint_vel),
+                (command.quat, ahead.quat),
+            )
+        )
+        self._ref_pos.copy_(joints.index_select(2, self._to_canonical))
+        self._ref_vel.copy_(vel.index_select(2, self._to_canonical))
+        here = (heading_quat(state.quat) if self.variant.heading else state.quat)[:, None].expand_as(quats)
+        here, pairs = here.flatten(0, 1), torch.cat((here, quats), 2).flatten(0, 1)
+        relative = self._relatives(here, pairs)
+        self._anchors.copy_(self._rot6d(relative, relative).view_as(self._anchors))
 
     def advance(self, rows: torch.Tensor | None = None) -> None:
         """Shift the histories; the raw output becomes the newest action."""
@@ -310,17 +373,17 @@ class SonicFrontEnd(FrontEnd):
 
 
 class EncoderDecoder(torch.nn.Module):
-    """The two official networks as one: observation [rows, 2692] → raw action [rows, 29]."""
+    """The two official networks as one: observation [rows, width + 930] → raw action [rows, 29]."""
 
-    def __init__(self, encoder: torch.nn.Module, decoder: torch.nn.Module):
-        """Join an encoder of 1762 numbers and a decoder of 994."""
+    def __init__(self, encoder: torch.nn.Module, decoder: torch.nn.Module, width: int = ENCODER_INPUT):
+        """Join an encoder of `width` numbers and a decoder of 994."""
         super().__init__()
-        self.encoder, self.decoder = encoder, decoder
+        self.encoder, self.decoder, self.width = encoder, decoder, width
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Raw actions, shape [rows, 29]."""
-        latent = self.encoder(obs[:, :ENCODER_INPUT].contiguous())
-        return self.decoder(torch.cat((latent, obs[:, ENCODER_INPUT:]), 1))
+        latent = self.encoder(obs[:, : self.width].contiguous())
+        return self.decoder(torch.cat((latent, obs[:, self.width :]), 1))
 
 
 class SonicTracker(NetworkTracker):
@@ -332,21 +395,31 @@ class SonicTracker(NetworkTracker):
     fast_physics_rate = PhysicsRate(dt=0.005, substeps=4)
     ignores = ("root xy", "root height")
     max_root_delta_deg = 26.0
+    variant = ""
+    """Key of `VARIANTS`."""
 
     @classmethod
-    def official(cls, checkpoint: str | Path) -> Self:
-        """The tracker of the official networks, which `official_pair` finds.
+    def official(cls, checkpoint: str | Path, variant: str = "") -> Self:
+        """The tracker of the official networks of a variant, which `official_pair` finds.
 
         Raises:
-            InputError: A file is absent or not a network of SONIC's widths.
+            InputError: A file is absent or not a network of the variant's widths.
         """
         encoder, decoder = official_pair(checkpoint)
+        front = SonicFrontEnd(variant=VARIANTS[variant])
         networks = (
-            OnnxSession(encoder, in_width=ENCODER_INPUT, out_width=LATENT),
+            OnnxSession(encoder, in_width=front.encoder_width, out_width=LATENT),
             OnnxSession(decoder, in_width=LATENT + PROPRIOCEPTION, out_width=JOINTS),
         )
         digest = hashlib.sha256(encoder.read_bytes() + decoder.read_bytes()).hexdigest()
-        return cls(SonicFrontEnd(), EncoderDecoder(*networks), checkpoint=str(checkpoint), checkpoint_hash=digest[:12])
+        joined = EncoderDecoder(*networks, front.encoder_width)
+        tracker = cls(front, joined, checkpoint=str(checkpoint), checkpoint_hash=digest[:12])
+        tracker.variant = variant
+        return tracker
+
+    def describe(self) -> dict[str, Any]:
+        """Facts to record with every result; the variant, where there is one."""
+        return super().describe() | ({"variant": self.variant} if self.variant else {})
 
 
 def official_pair(checkpoint: str | Path) -> tuple[Path, Path]:
@@ -378,12 +451,18 @@ def official_pair(checkpoint: str | Path) -> tuple[Path, Path]:
     return pair
 
 
-def from_checkpoint(checkpoint: Path | None) -> SonicTracker:
-    """Make the SONIC tracker: with the weights of this package, or with a checkpoint's.
+def from_checkpoint(checkpoint: Path | None, variant: str = "") -> SonicTracker:
+    """Make the SONIC tracker: with the weights of this package, or with a checkpoint's, of a variant or without.
 
     Raises:
-        InputError: The checkpoint is unfit, or there is none and no weights came with the package.
+        InputError: The checkpoint is unfit, or there is none and no weights came with the package; an unknown variant.
     """
+    if variant:
+        if variant not in VARIANTS:
+            raise InputError(f"--tracker sonic:{variant}: unknown; known are {', '.join(filter(None, VARIANTS))}")
+        if checkpoint is None or checkpoint.suffix == ".safetensors":
+            raise InputError(f"--tracker sonic:{variant}: pass --checkpoint with the folder of its official networks")
+        return SonicTracker.official(checkpoint, variant)
     checkpoint = checkpoint or weights_file.default("sonic", "--checkpoint with the folder of the official networks")
     if not checkpoint.is_dir() and checkpoint.suffix not in (".onnx", ".safetensors"):
         raise InputError(

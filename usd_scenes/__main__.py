@@ -56,10 +56,10 @@ def _validate(args: argparse.Namespace) -> int:
     from arena_newton import tasks
     from arena_newton.usd_scenes.validate import differences, task_of, validate
 
-    files = args.files or [name for name in tasks.names() if tasks.get(name).layer.is_file()]
-    for name in tasks.names():
-        if name in files:
-            files += sorted(str(path) for path in (tasks.get(name).layer.parent / "variants").glob("*.usda"))
+    files = args.files or [spec.name for spec in tasks.specs() if spec.layer.is_file()]
+    for spec in tasks.specs():
+        if spec.name in files:
+            files += sorted(str(path) for path in (spec.layer.parent / "variants").glob("*.usda"))
     wrong = 0
     for name in files:
         own_task = name if name in tasks.names() else None
@@ -87,11 +87,11 @@ def _validate(args: argparse.Namespace) -> int:
 def _list(args: argparse.Namespace) -> None:
     from arena_newton import tasks
 
-    for name in tasks.names():
-        path = tasks.get(name).layer
+    for spec in tasks.specs():
+        path = spec.layer
         variants = sorted(p.stem for p in (path.parent / "variants").glob("*.usda"))
         state = path if path.is_file() else "not built"
-        print(f"{name:12} {', '.join(['base', *variants]):36} {state}")
+        print(f"{spec.name:12} {', '.join(['base', *variants]):36} {state}")
 
 
 def _preview(args: argparse.Namespace) -> None:
@@ -103,7 +103,7 @@ def _preview(args: argparse.Namespace) -> None:
     for target in args.targets:
         if target not in tasks.names():
             check_files(target)
-    print(preview(args.targets or list(tasks.names()), args.out, args.size, *args.mode))
+    print(preview(args.targets or [spec.name for spec in tasks.specs()], args.out, args.size, *args.mode))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,7 +5,7 @@ rigid body, and that nothing is loaded from outside the folder tree or over a ne
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdUtils
@@ -14,6 +14,7 @@ from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.files import limits
 from arena_newton.tasks import Required
+from arena_newton.tasks.base import Kind
 from arena_newton.usd_scenes.compiled import compiled, lost_contacts, own_compiled, release
 from arena_newton.usd_scenes.dependencies import (
     LAYERS,
@@ -225,7 +226,7 @@ def _fault(stage: Usd.Stage, item: Required) -> tuple[str, str] | None:
     return (item.path, f"{message}: expected {wanted}") if message else None
 
 
-_KIND_WORDS = {
+_KIND_WORDS: Mapping[Kind, str] = {
     "body": "a rigid body (PhysicsRigidBodyAPI) with at least one collision geom",
     "fixture": "an articulation root with a rigid body `Frame` held by a fixed joint `anchor`, and a collision geom",
     "target": "an articulation root with a rigid body `Frame` held by a fixed joint `anchor`",
@@ -320,7 +321,7 @@ def _robot_fault(prim: Usd.Prim) -> str | None:
     return next((f"{p.GetName()}: {fault}" for p in bodies if (fault := _held_fault(p))), None)
 
 
-_KIND_TESTS = {
+_KIND_TESTS: Mapping[Kind, Callable[[Usd.Prim], str | None]] = {
     "body": _body_fault,
     "fixture": _fixture_fault,
     "target": _target_fault,

@@ -22,7 +22,7 @@ def _installed(group: str, path: tuple[str, ...]) -> importlib.metadata.EntryPoi
 
 
 class Registry[T]:
-    """Makers of one kind of thing; the built-in ones are imported when they are asked for."""
+    """Makers of one kind of thing, or things themselves; the built-in ones are imported when they are asked for."""
 
     def __init__(self, noun: str, group: str, base: Callable[[], type[T]], built_in: Mapping[str, str]):
         """Name the kind.
@@ -34,10 +34,10 @@ class Registry[T]:
             built_in: Name to `module:attribute` of a maker.
         """
         self.noun, self.group, self.base, self.built_in = noun, group, base, built_in
-        self._registered: dict[str, Callable[..., T]] = {}
+        self._registered: dict[str, Callable[..., T] | T] = {}
 
-    def register(self, name: str, factory: Callable[..., T]) -> None:
-        """Offer a maker in this process.
+    def register(self, name: str, factory: Callable[..., T] | T) -> None:
+        """Offer a maker, or a thing that is made, in this process.
 
         Raises:
             InputError: A built-in one has that name.
@@ -45,6 +45,10 @@ class Registry[T]:
         if name in self.built_in:
             raise InputError(f"{self.noun} {name!r}: is built in; register yours under another name")
         self._registered[name] = factory
+
+    def unregister(self, name: str) -> None:
+        """Take back what was offered in this process, if anything."""
+        self._registered.pop(name, None)
 
     def points(self, name: str | None = None) -> list[importlib.metadata.EntryPoint]:
         """Entry points of other packages, of one name or all."""
@@ -78,11 +82,11 @@ class Registry[T]:
             InputError: Unknown or doubled name, a package that does not load, or a maker that does not fit.
         """
         self.check(name)
-        if name not in self._registered and name in self.built_in:
-            module, _, attribute = self.built_in[name].partition(":")
-            own: Callable[..., T] = getattr(importlib.import_module(module), attribute)
-            return own(*arguments, **options)
-        factory = self._registered.get(name) or self._loaded(name)
+        factory = self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
+        if isinstance(factory, self.base()):
+            return factory
+        if not callable(factory):
+            raise InputError(f"--{self.noun} {name}: its package offers a {type(factory).__name__}, not a {self.noun}")
         try:
             inspect.signature(factory).bind(*arguments, **options)
         except TypeError as error:
@@ -95,9 +99,14 @@ class Registry[T]:
             raise InputError(f"--{self.noun} {name}: its factory makes a {type(made).__name__}, not a {kind}")
         return made
 
-    def _loaded(self, name: str) -> Callable[..., T]:
+    def _own(self, name: str) -> Callable[..., T] | T:
+        module, _, attribute = self.built_in[name].partition(":")
+        factory: Callable[..., T] | T = getattr(importlib.import_module(module), attribute)
+        return factory
+
+    def _loaded(self, name: str) -> Callable[..., T] | T:
         try:
-            factory: Callable[..., T] = self.points(name)[0].load()
+            factory: Callable[..., T] | T = self.points(name)[0].load()
             return factory
         except Exception as error:
             reason = " ".join(str(error).split())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -17,6 +18,7 @@ from arena_newton.differentiable.kernel_gradients import ReferenceState, referen
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
 from arena_newton.kernels import tick as codes
+from arena_newton.physics.dynamics import value_of
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.physics.policy_view import PolicyView
 from arena_newton.pictures.settings import policy_cameras
@@ -99,11 +101,16 @@ def closed_loop(
     shape = env.worlds, ticks, ACTION_WIDTH
     if isinstance(actor, torch.Tensor) and actor.shape != shape:
         raise InputError(f"closed_loop: actions of shape {list(actor.shape)}, expected {list(shape)}")
-    loop = _Loop(env, EngineStep(env.physics, parameters), factors)
+    env.reset(list(seeds))
     try:
+        loop = _Loop(env, EngineStep(env.physics, parameters), factors)
         return loop.run(actor, list(seeds), ticks, start, truncate or 0, checkpoint or 0)
     finally:
         env.release(range(env.worlds))
+
+
+_WITHOUT = ("state_latency", "action_latency", "push")
+"""Dynamics of an episode that are not part of the loop."""
 
 
 class _Graded(Tracker, Protocol):
@@ -143,6 +150,11 @@ class _Loop:
         self._physics = env.physics
         if not hasattr(env.tracker, "graded"):
             raise InputError(f"tracker {env.tracker.name} has no gradient: it defines no graded()")
+        if env.loop.lookahead or "foot_force" in getattr(env.tracker, "needs", ()):
+            raise InputError(f"tracker {env.tracker.name} has no gradient: it needs later references or foot forces")
+        for name, draws in itertools.product(_WITHOUT, env.draws):
+            if draws is not None and value_of(draws.dynamics, name) > 0.0:
+                raise InputError(f"closed_loop: mode {env.mode} draws a {name}, which has no gradient")
         self._tracker: _Graded = env.tracker.graded(env.worlds)
         if factors is None:
             factors = torch.ones(env.worlds, len(step.parameters), dtype=torch.float64)
@@ -150,7 +162,7 @@ class _Loop:
         self._factors, self._graded = factors, torch.is_grad_enabled()
         robot = env.scene.robot
         self._root = slice(robot.root_qpos, robot.root_qpos + 7)
-        self._turning = slice(robot.root_qvel + 3, robot.root_qvel + 6)
+        self._speed = slice(robot.root_qvel, robot.root_qvel + 6)
         order = robot.joint_qpos, robot.joint_qvel, robot.joint_ctrl, robot.hand_ctrl
         self._at, self._moving, self._joints, self._hands = (torch.tensor(np.asarray(part)).long() for part in order)
         fingers = len(robot.hand_ctrl)
@@ -171,7 +183,6 @@ class _Loop:
     ) -> Rolled:
         env, first = self._env, -self._env.startup_ticks
         self._last = ticks
-        env.reset(seeds)
         start = self._step.state() if start is None else start
         for world, row in enumerate(zip(start.qpos.detach().numpy(), start.qvel.detach().numpy(), strict=True)):
             self._physics.put(world, *row)
@@ -260,15 +271,15 @@ class _Loop:
         env, found = self._env, list[torch.Tensor]()
         for tick, action in enumerate(actions, begin):
             mimic, reference = reference_step(action, reference, max_root_delta_deg=env.tracker.max_root_delta_deg)
-            command = TrackerCommand(
-                mimic, mimic[:, 6:], reference.joint_vel[:, list(g1.MUJOCO_TO_CANONICAL)], reference.quat
-            )
-            root, turning = state.qpos[:, self._root], state.qvel[:, self._turning]
-            robot = RobotState(root[:, 3:], turning, state.qpos[:, self._at], state.qvel[:, self._moving])
+            joint_vel = reference.joint_vel[:, list(g1.MUJOCO_TO_CANONICAL)]
+            command = TrackerCommand(mimic, mimic[:, 6:], joint_vel, reference.quat, reference.position)
+            root, speed = state.qpos[:, self._root], state.qvel[:, self._speed]
+            joints = state.qpos[:, self._at], state.qvel[:, self._moving]
+            robot = RobotState(root[:, 3:], speed[:, 3:], *joints, position=root[:, :3], lin_vel=speed[:, :3])
             if tick == -env.startup_ticks and env.rules.startup.prefill:
                 tracker.prefill(command, robot)
-            joints = tracker.step(command, robot)
-            targets = joints.new_zeros(env.worlds, env.physics.nu).index_copy(1, self._joints, joints)
+            driven = tracker.step(command, robot)
+            targets = driven.new_zeros(env.worlds, env.physics.nu).index_copy(1, self._joints, driven)
             closes = (action[:, ACTION["hands"]] >= 0.5).repeat_interleave(len(self._hands) // 2, dim=1)
             targets = targets.index_copy(1, self._hands, torch.where(closes, self._closed, self._open))
             state = self._step(state, targets, self._factors)

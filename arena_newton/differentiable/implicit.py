@@ -4,6 +4,10 @@ The solver leaves an acceleration a at which inverse dynamics F(q, v, a), explic
 torque. That equation is differentiated instead of the solver's iterations: forward is `mj_step` itself, backward solves
 once with dF/da, the Hessian of the solver's cost. The integrator adds (M - h D)(v' - v) = h M a with a constant D, and
 q' = q + h v' on the manifold. Gradients of positions are tangent, of length nv, where a name does not say qpos.
+
+dF/da = M + J' R J and dF/dv = dC/dv + J' R b J are closed: J the constraints' Jacobian, R their stiffness where they
+act and 0 elsewhere, b their damping (`efc_J`, `efc_D`, `efc_KBIP` of MuJoCo), C Coriolis and passive forces. Only dF/dq
+is differenced: trees that no constraint connects move at once, and joints that move no constraint without constraints.
 """
 
 from __future__ import annotations
@@ -21,8 +25,10 @@ from arena_newton.physics.scene import Scene
 __all__ = ["ImplicitWorld", "Inputs", "check", "scaled"]
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+"""State of a constraint that acts."""
 _STEP = 1e-7
-"""Step of the differences of inverse dynamics [m, rad, and per s and s²]: a contact stiffens within 1 mm."""
+"""Step of the differences of inverse dynamics in positions [m, rad]: a contact stiffens within 1 mm."""
 _FACTOR_STEP = 1e-6
 """Step of the differences of inverse dynamics in a factor of the model."""
 _AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
@@ -67,6 +73,7 @@ def check(m: mujoco.MjModel) -> None:
         "nonlinear damping": m.dof_dampingpoly.any() or m.actuator_damping.any(),
         "gravity compensation by a drive": m.jnt_actgravcomp.any(),
         "a solver without slip": m.opt.noslip_iterations > 0,
+        "elliptic friction cones": m.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
     }
     for part, there in parts.items():
         if there:
@@ -132,7 +139,9 @@ class ImplicitWorld:
         self._origin, self._latch, self._substeps, self._parameters = model, scene.latch, substeps, parameters
         self._fields = {field for parameter in parameters for field, _ in parameter}
         self._model, self._inverse = copy.copy(model), copy.copy(model)
-        self._inverse.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # saves a third of inverse dynamics
+        self._inverse.opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)  # for dC/dv
+        self._inverse.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+        self._flags = self._inverse.opt.disableflags
         self._data = self.data = mujoco.MjData(model)
         joints = model.actuator_trnid[:, 0]
         self._dof, self._qadr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
@@ -149,7 +158,8 @@ class ImplicitWorld:
         self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
         self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
         self._mass_at = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
-        self._off_diagonal = self._mass_at[0] != self._mass_at[1]
+        self._rate_at = np.repeat(np.arange(model.nv), model.D_rownnz), model.D_colind
+        self._sparse = mujoco.mj_isSparse(model)
 
     def read(self, state: np.ndarray, locked: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The state of a running physics as a tick takes it: qpos, qvel and all else.
@@ -267,29 +277,75 @@ class ImplicitWorld:
             mujoco.mjd_quatIntegrate(step.v[part] + step.change[part], h, by_quat, by_vel, np.empty(3))
             at_v[part] += h * (by_vel.reshape(3, 3).T @ at_q[part] - at_q[part])
             at_q[part] = by_quat.reshape(3, 3).T @ at_q[part]
+        m.opt.disableflags = self._flags
         d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
-        by_q, by_v, by_a, mass_by_q = (np.empty((nv, width)) for width in (nv, nv, nv, m.nC))
-        mujoco.mjd_inverseFD(m, d, _STEP, False, by_q, by_v, by_a, None, None, None, mass_by_q)  # rows are inputs
-        mass = self._mass_matrix()
+        mujoco.mj_inverse(m, d)
+        mass, jacobian, (rows, columns) = self._mass_matrix(), self._jacobian(), self._rate_at
         y = h * np.linalg.solve(mass - h * np.diag(self._damping(m)), at_v)
-        w = np.linalg.solve(by_a, mass @ y)
+        stiffness = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0)
+        w = np.linalg.solve(mass + jacobian.T @ (stiffness[:, None] * jacobian), mass @ y)
+        damped = jacobian.T @ (stiffness * d.efc_KBIP[:, 1] * (jacobian @ w))
+        mujoco.mj_implicit(m, d)  # leaves qDeriv, and takes a step that nobody needs
+        at_v = at_v - damped + np.bincount(columns, d.qDeriv * w[rows], nv)
+        at_q = at_q + self._by_position(step, y, w, jacobian != 0.0)
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
-        rows, columns = self._mass_at
-        rest = step.a - step.change / h
-        pairs = y[rows] * rest[columns] + np.where(self._off_diagonal, y[columns] * rest[rows], 0.0)
-        at_q = at_q + mass_by_q @ pairs - by_q @ w
-        at_v = at_v - by_v @ w
         gain, bias, drive = m.actuator_gainprm, m.actuator_biasprm, driven[self._dof]
         at_q += np.bincount(self._dof, bias[:, 1] * drive, nv)
         at_v += np.bincount(self._dof, bias[:, 2] * drive, nv)
         return at_q, at_v, gain[:, 0] * drive, y, w
+
+    def _jacobian(self) -> np.ndarray:
+        """Jacobian of the constraints, shape [constraints, nv]."""
+        d = self._data
+        full = np.zeros((d.nefc, self._model.nv))
+        if self._sparse:
+            full[np.repeat(np.arange(d.nefc), d.efc_J_rownnz), d.efc_J_colind] = d.efc_J
+        else:
+            full.flat = d.efc_J
+        return full
+
+    def _by_position(self, step: _Substep, y: np.ndarray, w: np.ndarray, moves: np.ndarray) -> np.ndarray:
+        """Gradient of y · M(q) (a - (v' - v) / h) - w · F(q, v, a) to q.
+
+        Args:
+            step: It gives q, v, a and v' - v.
+            y: Weights of what the integrator equates to 0.
+            w: Weights of what the solver equates to 0.
+            moves: Which degree of freedom moves which constraint, shape [constraints, nv].
+        """
+        m, d, found = self._inverse, self._data, np.empty(len(w))
+        trees = np.eye(m.ntree)[m.dof_treeid]
+        touched = moves @ trees
+        joined = np.eye(m.ntree) + touched.T @ touched > 0.0
+        for _ in range(m.ntree.bit_length()):
+            joined = joined @ joined
+        moved, islands = moves.any(axis=0), np.eye(m.ntree)[joined.argmax(axis=1)[m.dof_treeid]]
+        rest, island = step.a - step.change / m.opt.timestep, int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        qpos, force = d.qpos, d.qfrc_inverse  # views: a property of MjData costs as much as the copy behind it
+        d.qvel[:] = step.v
+        for dofs, groups, flags in ((moved, islands, 0), (~moved, trees, int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT))):
+            m.opt.disableflags = self._flags | island | flags
+            at = np.flatnonzero(dofs)
+            row = (groups[at].cumsum(axis=0) * groups[at]).sum(axis=1).astype(int)  # from 1 on in each group
+            directions = np.zeros((row.max(initial=0) + 1, len(w)))
+            directions[row, at] = _STEP
+            forces, inertial = np.empty_like(directions), np.empty_like(directions)
+            for k, point in enumerate(step.q + self._ambient(step.q, directions, 0.5)):
+                qpos[:] = point
+                mujoco.mj_inverse(m, d)
+                mujoco.mj_mulM(m, d, inertial[k], rest)
+                forces[k] = force
+            sums = (y * inertial - w * forces) @ groups
+            found[at] = (groups[at] * (sums[row] - sums[0])).sum(axis=1) / _STEP
+        return found
 
     def _residuals(
         self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], targets: np.ndarray, factors: np.ndarray
     ) -> float:
         """Weighted sum of what integrator and solver equate to 0, whose slope in a factor is the number's."""
         m, d = self._inverse, self._data
+        m.opt.disableflags = self._flags
         self._scale(m, factors)
         total = 0.0
         for step, y, w in weighed:
@@ -308,11 +364,17 @@ class ImplicitWorld:
             found[v : v + 3] = 0.5 * (_AXES @ qpos[q : q + 4]) @ gradient[q : q + 4]
         return found
 
-    def _ambient(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Gradient in the coordinates of qpos, tangent to its unit quaternions."""
-        found = np.empty(self._model.nq)
-        found[self._line_q] = gradient[self._line_v]
+    def _ambient(self, qpos: np.ndarray, tangent: np.ndarray, turn: float = 2.0) -> np.ndarray:
+        """Moves or gradients in the coordinates of qpos, shape [..., nq], from tangent ones, shape [..., nv].
+
+        Args:
+            qpos: Where.
+            tangent: Moves or gradients per degree of freedom.
+            turn: Length in a quaternion's coordinates of a unit of angle: 1/2 for moves, 2 for gradients.
+        """
+        found = np.empty((*tangent.shape[:-1], self._model.nq))
+        found[..., self._line_q] = tangent[..., self._line_v]
         for q, v in self._quats:
             quat = qpos[q : q + 4]
-            found[q : q + 4] = 2.0 * gradient[v : v + 3] @ (_AXES @ quat) / (quat @ quat)
+            found[..., q : q + 4] = turn * tangent[..., v : v + 3] @ (_AXES @ quat) / (quat @ quat)
         return found

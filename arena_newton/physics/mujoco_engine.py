@@ -51,7 +51,6 @@ class MujocoPhysics(Physics):
         mujoco.set_mju_user_warning(_ignore_warning)
         for model in self._models:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._model_of = self._models * self.worlds if models is None else self._models
         self._data = [mujoco.MjData(model) for model in self._model_of]
         m = scene.mj_model
         self._host: dict[str, np.ndarray] = {

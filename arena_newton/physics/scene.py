@@ -229,6 +229,7 @@ class Scene:
             hand_ctrl=np.array([actuator_of_joint[j] for j in hand], dtype=np.int32),
             bodies=tuple(sorted(links.values())),
             critical_bodies=tuple(critical),
+            feet=tuple(links[f"{side}_ankle_roll_link"] for side in ("left", "right")),
         )
 
 
@@ -255,8 +256,10 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Usd.Stage:
     robot_prim = stage.GetPrimAtPath(ROBOT)
     if not robot_prim:
         raise InputError(f"{path}: prim {ROBOT} is missing")
-    if not robot_prim.GetVariantSet("hands").SetVariantSelection(hands):
-        raise InputError(f"{path}: prim {ROBOT} has no variant set 'hands'")
+    known_hands = robot_prim.GetVariantSet("hands").GetVariantNames()
+    if hands not in known_hands:
+        raise InputError(f"{path}: prim {ROBOT} has no hands {hands!r}, known are {' '.join(known_hands)}")
+    robot_prim.GetVariantSet("hands").SetVariantSelection(hands)
     world = stage.GetPrimAtPath("/World")
     sets = world.GetVariantSets()
     if variant is None:
@@ -271,7 +274,8 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Usd.Stage:
 
 def _set_drives(builder: newton.ModelBuilder, drive: g1.DriveGains) -> None:
     gains: dict[str, tuple[float, float, float, float | None]] = {
-        n: (drive.kp[i], drive.kd[i], drive.effort[i], None) for i, n in enumerate(g1.MUJOCO_JOINTS)
+        n: (drive.kp[i], drive.kd[i], drive.effort[i], drive.armature[i] if drive.armature else None)
+        for i, n in enumerate(g1.MUJOCO_JOINTS)
     }
     finger = (drive.finger_kp, drive.finger_kd, drive.finger_effort, drive.finger_armature)
     gains |= dict.fromkeys(g1.HAND_JOINTS, finger)

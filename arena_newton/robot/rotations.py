@@ -14,6 +14,7 @@ __all__ = [
     "gravity_in_body",
     "heading",
     "heading_np",
+    "heading_quat",
     "matrix_from_quat",
     "matrix_from_quat_np",
     "quat_apply",
@@ -112,6 +113,22 @@ def heading(quat: Tensor) -> Tensor:
     """Heading of unit quaternions [rad], atan2(2(wz + xy), 1 - 2(y² + z²))."""
     w, x, y, z = quat.unbind(-1)
     return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def heading_quat(quat: Tensor) -> Tensor:
+    """Rotations about the vertical by the heading of unit quaternions, wxyz, shapes [..., 4].
+
+    Sums, products, quotients and roots alone, which are exactly rounded: a row's bits do not depend on the other rows.
+    """
+    w, x, y, z = quat.unbind(-1)
+    ahead, left = 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)
+    length = torch.sqrt(ahead * ahead + left * left).clamp_min(torch.finfo(quat.dtype).tiny)
+    cosine, sine = ahead / length, left / length
+    larger = torch.sqrt(0.5 + 0.5 * cosine.abs())
+    smaller = 0.5 * sine / larger
+    front, zero = cosine >= 0.0, torch.zeros_like(w)
+    half = torch.where(front, larger, smaller.abs())
+    return torch.stack([half, zero, zero, torch.where(front, smaller, torch.copysign(larger, sine))], dim=-1)
 
 
 def roll_pitch(quat: Tensor) -> Tensor:

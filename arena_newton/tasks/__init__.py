@@ -1,13 +1,15 @@
-"""The tasks: the paper's seven, one file each, and those that other packages register."""
+"""The tasks: the paper's seven, one file each, and those of other packages: entry points, and what is registered."""
 
-import importlib
-
+from arena_newton.cli.registry import Registry
 from arena_newton.errors import InputError
 from arena_newton.tasks.base import Draws, LightDraw, ObjectSpec, Pose, Required, TaskSpec
+from arena_newton.tasks.interaction import Interaction
 
 __all__ = [
+    "OWN",
     "PAPER",
     "Draws",
+    "Interaction",
     "LightDraw",
     "ObjectSpec",
     "Pose",
@@ -16,33 +18,46 @@ __all__ = [
     "get",
     "names",
     "register",
+    "specs",
     "unregister",
 ]
 
 PAPER = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi")
-"""The paper's tasks in its order: three object tasks, four scene tasks."""
-_NAMES = PAPER
+"""The paper's tasks in its order: three object tasks, four scene tasks. `--task all` and the default run are these."""
+OWN = PAPER
 """All tasks of this package; one that is not the paper's follows here."""
-_registered: dict[str, TaskSpec] = {}
+_TASKS: Registry[TaskSpec] = Registry(
+    "task", "arena_newton.tasks", lambda: TaskSpec, {name: f"arena_newton.tasks.{name}:TASK" for name in OWN}
+)
 
 
 def names() -> tuple[str, ...]:
-    """Task names: the paper's, then those registered."""
-    return (*_NAMES, *_registered)
+    """Task names: the package's own, then those of others."""
+    return (*OWN, *(name for name in _TASKS.names() if name not in OWN))
 
 
 def get(name: str) -> TaskSpec:
     """A task by name.
 
     Raises:
-        InputError: Unknown task.
+        InputError: Unknown task, or one whose package does not load or offers something else.
     """
-    if name in _registered:
-        return _registered[name]
-    if name not in _NAMES:
-        raise InputError(f"--task {name}: unknown, choose from {', '.join(names())} or all")
-    spec: TaskSpec = importlib.import_module(f"arena_newton.tasks.{name}").TASK
-    return spec
+    spec = _TASKS.make(name)
+    if spec.name != name:
+        raise InputError(f"--task {name}: its package calls it {spec.name}; entry point and record need one name")
+    return spec if name in OWN else _whole(spec)
+
+
+def specs() -> tuple[TaskSpec, ...]:
+    """All tasks in the order of `names`, without those of other packages that `get` refuses."""
+    found = []
+    for name in names():
+        try:
+            found.append(get(name))
+        except InputError:
+            if name in OWN:
+                raise
+    return tuple(found)
 
 
 def register(spec: TaskSpec) -> None:
@@ -53,11 +68,18 @@ def register(spec: TaskSpec) -> None:
     """
     if spec.name in names() or spec.name == "all":
         raise InputError(f"task {spec.name!r}: the name is taken; register yours under another name")
-    if spec.scene is None:
-        raise InputError(f"task {spec.name!r}: `scene` must name the layer of its scene")
-    _registered[spec.name] = spec
+    _TASKS.register(_whole(spec).name, spec)
 
 
 def unregister(name: str) -> None:
-    """Remove a registered task; the paper's seven stay."""
-    _registered.pop(name, None)
+    """Remove a registered task; those of packages stay."""
+    _TASKS.unregister(name)
+
+
+def _whole(spec: TaskSpec) -> TaskSpec:
+    """A task of another package, which must bring what this package has for its own."""
+    if spec.scene is None:
+        raise InputError(f"task {spec.name!r}: `scene` must name the layer of its scene")
+    if spec.interaction is not None and not (spec.target or spec.interaction.sight):
+        raise InputError(f"task {spec.name!r}: `target` must name the prim to find, as it has an `interaction`")
+    return spec

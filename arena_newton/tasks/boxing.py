@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
@@ -19,13 +20,14 @@ from arena_newton.tasks.base import (
     draw_uniform,
     object_range,
 )
-from arena_newton.tasks.judge import PALMS, Judge, links, near, palms
+from arena_newton.tasks.interaction import Interaction
+from arena_newton.tasks.judge import Judge, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
     from arena_newton.physics.scene import Scene
 
-__all__ = ["PALMS", "TASK", "BoxingJudge", "BoxingRule"]
+__all__ = ["TASK", "BoxingJudge", "BoxingRule"]
 
 TARGET = "/World/Target"
 BOUNDS = f"{TARGET}/Frame/Bounds"
@@ -122,6 +124,14 @@ TASK = TaskSpec(
     success=ByRules(paper=BoxingRule(min_radius=0.0), released=BoxingRule(min_radius=0.10)),
     judge=BoxingJudge,
     predicates=PREDICATES,
+    target=TARGET,
+    # A fist that lands beside the target is still on the bag, whose radius is 0.15 m. The expert strikes from 0.45 m
+    # off the bag's axis with the target 0.1 to 0.3 rad to its side; a hand reaches 45 degrees aside without a step.
+    interaction=Interaction(BOUNDS, PALMS, touch=0.20, stance=0.60, bearing=0.8),
+    without_legs=(
+        "the target's centre is 0.75 to 0.85 m high and counts from 0.13 m away, and a pelvis that glides at 0.8 m has "
+        "its shoulders 0.3 m above that: the arms alone reach down to it, from wherever the base rolls"
+    ),
     semantic_change="shape",
     recolour={TARGET: 0.0},
     expert="arena_newton.policies.experts.boxing:BoxingExpert",

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import BodyFrame
+from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
@@ -148,6 +150,12 @@ TASK = TaskSpec(
     ),
     judge=DoubleDeskJudge,
     predicates=PREDICATES,
+    target=HAMMER,
+    # The palm is 5 cm from the handle that it grasps and hovers 0.17 m above it. The expert stands 0.23 to 0.40 m from
+    # the hammer. Episodes begin 0.82 m and more from it, which is not near yet.
+    interaction=Interaction(
+        HAMMER, PALMS, touch=TOUCH, stance=0.40, predicate="contact", bearing=1.0, near=0.80, carried=True, loose=True
+    ),
     semantic_change="texture",
     recolour={HAMMER: 0.15, BASKET: 0.15},
     expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import FEET, TOE
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import BodyFrame
-from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near
+from arena_newton.tasks.interaction import Interaction
+from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, origin
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
@@ -20,10 +22,6 @@ __all__ = ["TASK", "FootballJudge", "FootballRule"]
 BALL = "/World/Ball"
 GOAL = "/World/Goal/Volume"
 PITCH = "/World/Pitch"
-FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
-
-TOE = (0.12, 0.0, -0.02)
-"""Front of a foot in its ankle link [m]: the sole ends 0.14 m ahead of it."""
 KICK = 0.06
 """Distance of a toe to the ball's bounding box [m] that counts as contact: half a foot's width, and some motion."""
 ROLLING = 0.5
@@ -78,7 +76,7 @@ class FootballJudge(Judge):
         """Bind ball, goal and pitch."""
         self.rule: FootballRule = rules.task("football").success
         self.ball = scene.body_id(BALL)
-        ball, goal = BodyFrame(self.ball, (0.0, 0.0, 0.0), IDENTITY), scene.marker(GOAL)
+        ball, goal = origin(scene, BALL), scene.marker(GOAL)
         surface, speed = bounding_box(scene, BALL), scene.joint_qvel(BALL)
         toes = [BodyFrame(foot.body_id, TOE, IDENTITY) for foot in links(scene, *FEET)]
         super().__init__(
@@ -141,6 +139,16 @@ TASK = TaskSpec(
     ),
     judge=FootballJudge,
     predicates=PREDICATES,
+    target=BALL,
+    # The toe's distance is the one of the task's own `contact`. It is 0.12 m before the ankle and swings another 0.3 m
+    # ahead while the other foot stands. The expert walks through the ball, and turns and steps back below 0.35 m/s.
+    interaction=Interaction(
+        BALL, FEET, touch=KICK, stance=0.40, predicate="contact", bearing=0.8, loose=True, slow=0.35, tip=TOE
+    ),
+    without_legs=(
+        "the rule asks where the ball goes, not how: the feet that hang from the gliding base meet it as a bumper "
+        "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
+    ),
     semantic_change="texture",
     recolour={BALL: 0.0},
     expert="arena_newton.policies.experts.football:FootballExpert",

@@ -69,3 +69,5 @@ class RobotHandles:
     """MuJoCo body ids of every link."""
     critical_bodies: tuple[int, ...] = ()
     """Links that count for the fall rule's contact test."""
+    feet: tuple[int, ...] = ()
+    """Links that carry the soles, left and right."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 from arena_newton.tasks.handles import BodyFrame, Marker
 
@@ -24,10 +25,11 @@ if TYPE_CHECKING:
     from arena_newton.kernels.launching import Recorded
     from arena_newton.physics.engines import Physics
     from arena_newton.physics.scene import Scene
+    from arena_newton.rules.rule_types import RuleSet
 
-__all__ = ["PALMS", "Condition", "Judge", "above", "bounding_box", "links", "near", "palms", "top"]
+__all__ = ["Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
+__all__ += ["origin", "palms", "slow", "standing", "top"]
 
-PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 _ABOVE = 50.0
 """Half extent of the box that represents everything above a height [m]: larger than any scene."""
 
@@ -36,7 +38,7 @@ _ABOVE = 50.0
 class Condition:
     """One measured quantity against a limit; a predicate holds where all of its conditions do."""
 
-    kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin"]
+    kind: Literal["near", "clear", "angle", "toward", "away", "unlatched", "margin", "slow", "upright"]
     """Measured quantity, described in `kernels.rules.predicates`."""
     limit: float = 0.0
     """Limit in the unit of the kind."""
@@ -57,6 +59,22 @@ def above(point: BodyFrame, height: float) -> Condition:
     """A point is higher than `height` [m]."""
     half = (_ABOVE, _ABOVE, _ABOVE)
     return Condition("near", 0.0, (point,), (Marker(0, (0.0, 0.0, height + _ABOVE), IDENTITY, half),))
+
+
+def slow(scene: Scene, prim: str, limit: float) -> Condition:
+    """A free body's origin moves with at most `limit` [m/s]."""
+    return Condition("slow", limit, address=scene.joint_qvel(prim))
+
+
+def standing(scene: Scene, rules: RuleSet) -> tuple[Condition, ...]:
+    """The robot stands, as a rule set says."""
+    pelvis = links(scene, "pelvis")
+    return above(*pelvis, rules.standing.min_root_z), Condition("upright", rules.standing.min_up, pelvis)
+
+
+def origin(scene: Scene, prim: str) -> BodyFrame:
+    """Origin of a rigid prim."""
+    return BodyFrame(scene.body_id(prim), (0.0, 0.0, 0.0), IDENTITY)
 
 
 def links(scene: Scene, *names: str) -> tuple[BodyFrame, ...]:
@@ -141,12 +159,12 @@ class Judge:
             """1 where a predicate of the task holds at this tick, shape [worlds, n]."""
         self.counters: list[wp.array] = [self.predicates[:, k] for k in range(len(names))]
         """int32 arrays [worlds] that a reset clears."""
-        self._upload(list(conditions.values()))
+        self._conditions = self.table(*conditions.values())
         self._recorded: Recorded | None = None
         self._physics: Physics | None = None
 
-    def _upload(self, predicates: Sequence[Sequence[Condition]]) -> None:
-        """Copy the conditions' table to the device."""
+    def table(self, *predicates: Sequence[Condition]) -> dict[str, wp.array]:
+        """Conditions of some predicates on the device, as arguments of `kernels.rules.predicates`."""
         import warp as wp
 
         from arena_newton.kernels.rules.predicates import KINDS, TERM
@@ -166,7 +184,7 @@ class Judge:
             return wp.array(values, dtype=dtype, device=self.device)
 
         bodies, positions = self.points(*points)
-        self._conditions = {
+        return {
             "first": up(first, wp.int32),
             "terms": up(np.array(rows, dtype=np.int32).reshape(-1, len(TERM)), wp.int32),
             "limits": up(limits, wp.float32),
@@ -244,3 +262,39 @@ class Judge:
 
         for array in (*self.counters, self.success, self.event):
             launch_clear(mask, array)
+
+
+class ConditionsJudge(Judge):
+    """Success where all of some conditions hold, for some ticks in a row: a task that needs no kernel of its own.
+
+    The margin is the smallest slack of the conditions, in metres, metres per second and cosines alike: at least 0 where
+    all hold at this instant. It is not differentiable.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        predicates: Sequence[Predicate],
+        conditions: Mapping[str, Sequence[Condition]],
+        success: Sequence[Condition],
+        ticks: int = 1,
+    ):
+        """Bind conditions to the scene.
+
+        Args:
+            scene: The built scene.
+            predicates: As of `Judge`.
+            conditions: As of `Judge`.
+            success: Conditions of success.
+            ticks: Ticks in a row for which all of them must hold.
+        """
+        super().__init__(scene, predicates, conditions)
+        self._success, self._ticks, self._held = self.table(success), ticks, self.counter()
+        del self._success["first"]  # one conjunction
+
+    def decide(self, physics: Physics) -> None:
+        """See `Judge.decide`."""
+        from arena_newton.kernels.rules.predicates import launch_conditions
+
+        state = physics.xpos, physics.xquat, physics.qpos, physics.qvel, physics.latch_locked
+        launch_conditions(*state, **self._success, ticks=self._ticks, counter=self._held, **self.outputs())

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
-from arena_newton.robot.g1 import TICK
+from arena_newton.robot.g1 import PALMS, TICK
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import ROBOT, BodyFrame, Marker
+from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Condition, Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
@@ -189,6 +190,16 @@ TASK = TaskSpec(
     success=ByRules(paper=PPBoxAnyDeckRule(), released=PPBoxOneDeckRule()),
     judge=PPBoxJudge,
     predicates=PREDICATES,
+    target=BOX,
+    # A palm is 6 cm from the box when its fist squeezes it, and 0.16 m when it begins to close. The expert stands 0.22
+    # to 0.30 m before the box. Episodes begin 0.9 m and more before it, which is not near yet.
+    interaction=Interaction(
+        BOX, PALMS, touch=TOUCH, stance=0.45, predicate="contact", bearing=0.8, near=0.85, carried=True, loose=True
+    ),
+    without_legs=(
+        "the box is on a table and the only empty deck is 0.67 m high, at hip height: arms alone lift the box, hold it "
+        "and set it down, and a base that rolls carries it there. Only a lower deck would ask for a crouch"
+    ),
     light=ByRules(paper=None, released=DISTANT_LIGHT),
     semantic_change="clutter",
     recolour={BOX: 0.15},

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 
-from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
+from arena_newton.interfaces import NEEDS, RobotState, Tracker, TrackerCommand
 from arena_newton.robot.canonical import MIMIC, MIMIC_WIDTH
 from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS, SPAWN_HEIGHT, TICK, DriveGains, PhysicsRate
 from arena_newton.testing.findings import CheckResult, ConformanceError, Promise, Violation, json_object, perform
@@ -44,7 +44,7 @@ def _normalised(quat: np.ndarray) -> np.ndarray:
     return unit
 
 
-@functools.lru_cache(maxsize=1024)
+@functools.lru_cache(maxsize=4096)
 def _row(number: int, tick: int) -> dict[str, np.ndarray]:
     """A plausible command and state of one robot at one tick."""
     rng = np.random.default_rng([number, tick])
@@ -66,9 +66,14 @@ def _row(number: int, tick: int) -> dict[str, np.ndarray]:
         "ang_vel": 0.5 * rng.standard_normal(3),
         "joint_pos": pose + 0.2 * rng.standard_normal(JOINTS),
         "measured_vel": rng.standard_normal(JOINTS),
+        "position": rng.standard_normal(3),
+        "lin_vel": 0.5 * rng.standard_normal(3),
+        "foot_force": 200.0 * rng.random(2),
+        "reference_position": rng.standard_normal(3),
     }
 
 
+@functools.lru_cache(maxsize=4096)
 def _zero_row(number: int, tick: int) -> dict[str, np.ndarray]:
     """Nothing but zeros; orientations, which have no zero, are the identity."""
     zeros = {key: np.zeros_like(value) for key, value in _row(number, tick).items()}
@@ -76,10 +81,12 @@ def _zero_row(number: int, tick: int) -> dict[str, np.ndarray]:
     return zeros
 
 
+@functools.lru_cache(maxsize=4096)
 def _extreme_row(number: int, tick: int) -> dict[str, np.ndarray]:
     """Far beyond what a robot does: joints at 3 rad, 100 rad/s, any orientation."""
     rng = np.random.default_rng([number, tick, 1])
     scales = {"mimic": 5.0, "joints": 3.0, "joint_vel": 100.0, "ang_vel": 50.0, "joint_pos": 3.0, "measured_vel": 100.0}
+    scales |= {"position": 100.0, "lin_vel": 50.0, "foot_force": 5000.0, "reference_position": 100.0}
     row = {key: np.zeros_like(value) for key, value in _row(number, tick).items()}
     for key, scale in scales.items():
         row[key] = scale * rng.choice([-1.0, 1.0], row[key].shape)
@@ -117,13 +124,24 @@ class _Trial:
 
     def frame(self, tick: int, rows: Sequence[int] | None = None, kind: RowMaker = _row) -> Frame:
         """Command and state of a tick for the robots of `rows`, on the device."""
-        made = [kind(number, tick) for number in (self.rows if rows is None else rows)]
+        numbers, needs = self.rows if rows is None else rows, getattr(self.tracker, "needs", ())
 
-        def stacked(key: str) -> torch.Tensor:
-            return torch.tensor(np.stack([one[key] for one in made]), dtype=torch.float32, device=self.device)
+        def stacked(key: str, *ticks: int) -> torch.Tensor:
+            values = np.stack([[kind(number, one)[key] for one in ticks or (tick,)] for number in numbers])
+            return torch.tensor(values if ticks else values[:, 0], dtype=torch.float32, device=self.device)
 
-        command = TrackerCommand(*(stacked(key) for key in ("mimic", "joints", "joint_vel", "target_quat")))
-        return command, RobotState(*(stacked(key) for key in ("quat", "ang_vel", "joint_pos", "measured_vel")))
+        def command(*ticks: int) -> TrackerCommand:
+            made = TrackerCommand(*(stacked(key, *ticks) for key in ("mimic", "joints", "joint_vel", "target_quat")))
+            made.position = stacked("reference_position", *ticks) if "position" in needs else None
+            return made
+
+        now = command()
+        state = RobotState(*(stacked(key) for key in ("quat", "ang_vel", "joint_pos", "measured_vel")))
+        for name in NEEDS:
+            setattr(state, name, stacked(name) if name in needs else None)
+        if window := getattr(self.tracker, "lookahead", 0):
+            now.ahead = command(*range(tick + 1, tick + 1 + window))
+        return now, state
 
     def only(self, worlds: int | None = None) -> torch.Tensor:
         """The mask of the one world that is treated specially."""
@@ -165,13 +183,19 @@ class _Trial:
                 continue
             if not isinstance(drive, DriveGains):
                 raise Violation(f"{role} is a {type(drive).__name__}, expected DriveGains")
-            for part, least in (("kp", 0.0), ("kd", 0.0), ("effort", 1e-9)):
+            for part, least in (("kp", 0.0), ("kd", 0.0), ("effort", 1e-9), ("armature", 0.0)):
                 gains = getattr(drive, part)
+                if part == "armature" and gains is None:
+                    continue
                 if len(gains) != JOINTS or not all(math.isfinite(gain) and gain >= least for gain in gains):
                     raise Violation(f"{role}.{part} must be {JOINTS} finite numbers of at least {least:g}: {gains}")
         turn = tracker.max_root_delta_deg
         if not (isinstance(turn, int | float) and math.isfinite(turn) and turn >= 0.0):
             raise Violation(f"max_root_delta_deg is {turn!r}, expected degrees per tick, 0 for no limit")
+        window, unknown = getattr(tracker, "lookahead", 0), set(getattr(tracker, "needs", ())) - set(NEEDS)
+        if unknown or not isinstance(window, int) or window < 0:
+            wrong = f"needs holds {sorted(unknown)}, known are {NEEDS}" if unknown else f"lookahead is {window!r}"
+            raise Violation(f"{wrong}; expected names of further fields, and a number of ticks")
 
     def rate(self) -> None:
         for fast in (False, True):
@@ -306,8 +330,9 @@ class _Trial:
             else:
                 self.step(frame, mask if what != "step" else None)
             for part, before in zip(frame, kept, strict=True):
-                for field, value in vars(part).items():
-                    if not torch.equal(value, getattr(before, field)):
+                kept_tensors = before.tensors()
+                for field, value in part.tensors().items():
+                    if not torch.equal(value, kept_tensors[field]):
                         raise Violation(f"{what} writes into {type(part).__name__}.{field}")
             if not torch.equal(mask, only):
                 raise Violation(f"{what} writes into its mask")
@@ -319,8 +344,8 @@ class _Trial:
         held = self.frame(0)
         for tick in range(TICKS):
             for part, new in zip(held, self.frame(tick), strict=True):
-                for field, value in vars(part).items():
-                    value.copy_(getattr(new, field))
+                for value, number in zip(part.tensors().values(), new.tensors().values(), strict=True):
+                    value.copy_(number)
             self.same(
                 self.step(held), expected[tick], f"inputs in new and in reused buffers (tick {tick})", "copy them"
             )

@@ -71,9 +71,9 @@ def found_probability(forged: float, episodes: int) -> float:
 
 def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
     """Flags by which the episodes of a run are played here with a policy, and flags of more kinds of the run."""
-    more = (Remote,) if policy.startswith("remote:") else ()
-    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds, *more) for name in flags_of(kind))
-    same = {name: getattr(stored, name) for name in (*groups_of, "task", "tracker", "seeds", "repeats", "checkpoint")}
+    groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
+    others = (*Remote.names_for(policy), "task", "tracker", "seeds", "repeats", "checkpoint")
+    same = {name: getattr(stored, name) for name in (*groups_of, *others)}
     return RunOptions(**same | {"policy": policy, "engine": ENGINE, "device": "cpu", "actions": False})
 
 
@@ -227,7 +227,7 @@ def played(
             env,
             policy,
             group,
-            recorder=recorders,
+            recorder=[*recorders, *made.recorders(env)],
             max_steps=group[0].max_steps,
             latency=latency,
             on_finish=results.append,
@@ -267,6 +267,7 @@ def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidenc
     """Hold an episode that was played again to its line."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
+    again |= {"extra": result.extra} if result.extra else {}
     again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TypedDict
 
@@ -25,6 +26,8 @@ __all__ = ["FILE", "Facts", "document", "html", "markdown", "printed", "write"]
 FILE = "certify.json"
 FEW = 20
 """Number of episodes below which a cell is marked as having few."""
+PAGE = 250
+"""Lines of a page of evidence, at most."""
 MEANING = {
     "pass": "holds",
     "fail": "does not hold",
@@ -58,7 +61,7 @@ class Facts(TypedDict):
 
 
 def write(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) -> None:
-    """Write certify.json, certify.md and certify.html into a folder.
+    """Write certify.json, certify.html, certify.md and its pages of evidence into a folder.
 
     Args:
         folder: The certification's.
@@ -66,7 +69,8 @@ def write(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) ->
         findings: What was found so far.
     """
     write_atomic(folder / FILE, json.dumps(document(folder, facts, findings), indent=2) + "\n")
-    write_atomic(folder / "certify.md", markdown(facts, findings))
+    for name, page in markdown(facts, findings).items():
+        write_atomic(folder / name, page)
     write_atomic(folder / "certify.html", html(facts, findings))
 
 
@@ -151,25 +155,51 @@ def printed(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
     return "\n".join([*lines, "", *_warnings(facts)]).rstrip()
 
 
-def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:
-    """The certificate as Markdown, without pictures."""
+def markdown(facts: Facts, findings: Mapping[Check, CheckFinding]) -> dict[str, str]:
+    """The certificate as Markdown, without pictures.
+
+    Returns:
+        File name → page: `certify.md` with the claims, and the evidence in pages of at most `PAGE` lines, longer only
+        where that of one check is.
+    """
+    claims, rows = claimed(findings), []
+    pages: list[list[str]] = []
+    for one in claims:
+        measured = []
+        for (check, finding), (name, text) in zip(one.findings, _measured(one), strict=True):
+            section = _section(check, finding)
+            if not pages or len(pages[-1]) + len(section) > PAGE:
+                pages.append([f"# Certificate: evidence, page {len(pages) + 1}", "", "[All claims](certify.md)"])
+            pages[-1] += section
+            measured.append(f"[{name}](certify_{len(pages)}.md#{name}-{finding.verdict}): {escaped(text)}")
+        rows.append((escaped(one.text), one.verdict, "<br>".join(measured)))
     lines = ["# Certificate", "", f"**{escaped(verdict_of(findings, len(facts['planned'])))}**", ""]
     lines += [line for text in _warnings(facts) for line in (f"> {escaped(text)}", "")]
-    claims, rows = claimed(findings), []
-    for one in claims:
-        verdicts = {check.name: finding.verdict for check, finding in one.findings}
-        measured = [f"[{name}](#{name}-{verdicts[name]}): {escaped(text)}" for name, text in _measured(one)]
-        rows.append((escaped(one.text), one.verdict, "<br>".join(measured)))
     lines += Table(("claim", "verdict", "measured"), rows).compact()
     lines += ["", "; ".join(f"{verdict}: {meaning}" for verdict, meaning in MEANING.items()) + ".", ""]
     lines += ["## What was certified", ""]
     lines += [f"- {name}: {escaped(text)}" for name, text in _described(facts)]
-    for check, finding in (part for one in claims for part in one.findings):
-        lines += ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary), ""]
-        for sheet in finding.sheets:
-            lines += [f"{escaped(sheet.title)}:", "", *sheet.compact(escaped), ""]
-        lines += [f"- {escaped(note)}" for note in finding.notes]
-    return "\n".join(lines).rstrip() + "\n"
+    written = {"certify.md": lines} | {f"certify_{number}.md": page for number, page in enumerate(pages, start=1)}
+    return {name: "\n".join(page).rstrip() + "\n" for name, page in written.items()}
+
+
+def _section(check: Check, finding: CheckFinding) -> list[str]:
+    """A check's question, finding, tables and notes as lines of Markdown."""
+    lines = ["", f"## {check.name}: {finding.verdict}", "", check.question, "", escaped(finding.summary)]
+    for sheet in finding.sheets:
+        lines += ["", f"{escaped(sheet.title)}:", "", *_joined(sheet).compact(escaped)]
+    return lines + ([""] if finding.notes else []) + [f"- {escaped(note)}" for note in finding.notes]
+
+
+def _joined(sheet: Table) -> Table:
+    """A table whose rows that differ in task, tracker or rule set alone are one."""
+    rows = [tuple(map(str, row)) for row in sheet.rows]
+    for column in (number for number, name in enumerate(sheet.head) if name in ("task", "tracker", "rules")):
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for row in rows:
+            alike.setdefault(row[:column] + row[column + 1 :], []).append(row[column])
+        rows = [(*key[:column], ", ".join(names), *key[column:]) for key, names in alike.items()]
+    return replace(sheet, rows=rows)
 
 
 def html(facts: Facts, findings: Mapping[Check, CheckFinding]) -> str:

@@ -79,7 +79,7 @@ def run(
     bodies: Mapping[str, Body] = BODIES | failures.BODIES,
     checks: Sequence[Check] = CHECKS,
 ) -> int:
-    """Run the checks, print a line for each, and write certify.json, certify.md and certify.html.
+    """Run the checks, print a line for each, and write the certificate's files.
 
     Args:
         options: The flags.

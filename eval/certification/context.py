@@ -233,12 +233,12 @@ def with_expert(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
     """Tasks that an expert can be measured on, and those that have none.
 
     Args:
-        names: Task names; empty or `all`: every task.
+        names: Task names; empty or `all`: the paper's.
 
     Raises:
         InputError: An unknown name, or one named twice.
     """
-    chosen = tasks.names() if tuple(names) in ((), ("all",)) else tuple(names)
+    chosen = tasks.PAPER if tuple(names) in ((), ("all",)) else tuple(names)
     for name in chosen:
         tasks.get(name)
         if chosen.count(name) > 1:

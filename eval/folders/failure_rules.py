@@ -10,10 +10,11 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+from arena_newton import tasks
 from arena_newton.eval.folders.failure_stage import FailureStage
-from arena_newton.eval.plan.interaction import INTERACTIONS, Interaction
 from arena_newton.eval.records.episode_signals import EpisodeSignals
 from arena_newton.eval.records.journal import EpisodeRecord
+from arena_newton.tasks.interaction import Interaction
 
 __all__ = ["BARS", "BAND", "Bars", "near_bars", "sees_at_start", "stage_of", "waits_in_view"]
 
@@ -59,7 +60,7 @@ SEEN = 10
 """Pixels of 224 x 168 from which on the first picture shows the object, as in the check `visible`."""
 ENDING = ("ball_out",)
 """Causes that end an episode: after these there was nothing to recover."""
-_OTHER = Interaction("", "", (), touch=0.0, stance=0.0)
+_OTHER = Interaction("", (), touch=0.0, stance=0.0)
 """A task that this installation has no entry of; its folders are read all the same."""
 WAITS = 0.5
 """Fraction of an episode for which a robot that waits stays slow near the object without a break, and of the looks that
@@ -76,7 +77,7 @@ def stage_of(episode: EpisodeRecord, bars: Bars = BARS) -> FailureStage | None:
     fell = episode.outcome == "fall"
     if signals.tracking_error > bars.tracking_error and signals.reference_tilt < bars.reference_tilt:
         return FailureStage.TRACKING
-    task = INTERACTIONS.get(episode.task, _OTHER)
+    task = _interaction(episode.task)
     touched = _touched(episode, signals, task)
     if touched is not None and not (fell and episode.steps - touched < bars.first_touch):
         if _without_effect(episode, signals, task, bars):
@@ -92,6 +93,10 @@ def stage_of(episode: EpisodeRecord, bars: Bars = BARS) -> FailureStage | None:
     if fell or aligned or (stays and _in_pose(signals, task, bars)):
         return FailureStage.POSTURE
     return FailureStage.APPROACH if engaged else FailureStage.PERCEPTION
+
+
+def _interaction(task: str) -> Interaction:
+    return (tasks.get(task).interaction if task in tasks.names() else None) or _OTHER
 
 
 def _touched(episode: EpisodeRecord, signals: EpisodeSignals, task: Interaction) -> int | None:
@@ -130,7 +135,7 @@ def near_bars(episode: EpisodeRecord) -> tuple[str, ...]:
         others = (dataclasses.replace(BARS, **{name: getattr(BARS, name) * (1.0 + by)}) for by in (-BAND, BAND))
         if any(stage_of(episode, bars) != stage for bars in others):
             found.append(name)
-    touch = INTERACTIONS.get(episode.task, _OTHER).touch
+    touch = _interaction(episode.task).touch
     if stage is not FailureStage.TRACKING and abs(signals.reach_distance - touch) < BAND * touch:
         found.append("reach_distance")
     return tuple(found)

@@ -21,7 +21,6 @@ from arena_newton.data.recording.noise_levels import NoiseLevels
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan, rounds
 from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
-from arena_newton.eval.plan.interaction import check_interactions
 from arena_newton.eval.plan.options import (
     QUICK_REPEATS,
     QUICK_SEEDS,
@@ -41,6 +40,7 @@ from arena_newton.eval.records.identity import (
     foreign_task,
     hash_path,
     layers_hash,
+    mode_facts,
     own_code,
     scenes_hash,
 )
@@ -58,7 +58,8 @@ from arena_newton.pictures.settings import (
 )
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
-from arena_newton.rules import seeding
+from arena_newton.policies.remote.program import ProgramCommand
+from arena_newton.rules import modes, seeding
 
 if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
@@ -120,6 +121,8 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str
     """The package's own code that moves and judges, by content."""
+    mode_facts: Mapping[str, JsonObject] = dataclasses.field(default_factory=dict)
+    """Hashes of each mode whose ranges are not the rule set's."""
     foreign_tasks: Mapping[str, JsonObject] = dataclasses.field(default_factory=dict)
     """Hashes of scene and code of each task that another package brings; the built-in ones are hashed as a whole."""
     shard: Shard | None = None
@@ -169,6 +172,7 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
+            **({"mode_facts": dict(self.mode_facts)} if self.mode_facts else {}),  # type: ignore[typeddict-item]
             **({"foreign_tasks": dict(self.foreign_tasks)} if self.foreign_tasks else {}),  # type: ignore[typeddict-item]
             **self._chunks(),
             **self._budget(),
@@ -291,16 +295,16 @@ def resolve(options: RunOptions) -> RunConfig:
     """
     check_flags(options)
     quick = is_quick(options)
-    tasks = task_specs.names() if options.task in ((), ("all",)) else tuple(options.task)
-    if quick and options.policy == "expert":  # a task that was added may have none
-        tasks = tuple(name for name in tasks if task_specs.get(name).expert is not None)
+    tasks = task_specs.PAPER if options.task in ((), ("all",)) else tuple(options.task)
     scheme, _, target = options.policy.partition(":")
     if scheme == "learned":
         card = _card(target)
         tasks = tasks if options.task else card.tasks
         card.check_tasks(tasks)
     if options.failures:
-        check_interactions(tasks)
+        without = [task for task in tasks if task_specs.get(task).interaction is None]
+        if without:
+            raise InputError(f"--failures: no signals are defined for {' '.join(without)} (`TaskSpec.interaction`)")
     # Weights that are named are one tracker's; the default run has two.
     several = QUICK_TRACKERS if quick and options.checkpoint is None else (DEFAULT_TRACKER,)
     used = tuple(options.tracker) or several
@@ -314,6 +318,9 @@ def resolve(options: RunOptions) -> RunConfig:
     else:
         policy_path, ending = None, ""
     label = f"{scheme}:{_shown(policy_path)}{ending}" if policy_path else options.policy
+    program = ProgramCommand.read(target) if scheme == "process" else None
+    if program is not None:
+        options, label = dataclasses.replace(options, policy=f"process:{program.text}"), f"process:{program.shown}"
     variant = _existing("--variant", options.variant)
     if variant is not None and len(tasks) != 1:
         raise InputError(f"--variant {options.variant}: name the one task it belongs to with --task")
@@ -351,6 +358,7 @@ def resolve(options: RunOptions) -> RunConfig:
         seed_range=seeding.EVALUATION if flags.series is None else seeding.DEMONSTRATION,
         most=flags.max,
     )
+    rule_set = rule_sets.get(options.rules)
     shard = None if options.shard is None else parse_shard(options.shard)
     if shard is not None and shard.count > len(episodes):
         raise InputError(f"--shard {shard}: the plan has {counted(len(episodes), 'episode')}, expected no more shards")
@@ -359,6 +367,8 @@ def resolve(options: RunOptions) -> RunConfig:
     video_size, policy_options = _size(options.video_size), _policy_options(options)
     recording = recorded_cameras(options) if options.record else None
     policy_hash = hash_path(_decisive(scheme, policy_path)) if policy_path else None
+    if program is not None and program.decisive:
+        policy_hash = config_hash([hash_path(file) for file in program.decisive])
     variant_hash = layers_hash(variant) if variant else None
     if options.dealt:
         engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
@@ -380,10 +390,11 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_options=policy_options,
         checkpoint_hashes=checkpoint_hashes,
         policy_hash=policy_hash,
-        rules_hash=rule_sets.get(options.rules).hash_for(tasks),
+        rules_hash=rule_set.hash_for(tasks),
         variant_hash=variant_hash,
         scenes_hash=scenes_hash(tasks, task_specs.names(), flags.mode),
         code_hash=code_hash(),
+        mode_facts={name: facts for name in flags.mode if (facts := mode_facts(name, rule_set, tasks))},
         foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
     )
 
@@ -442,9 +453,9 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
         raise InputError(f"{flag}looks {options.record_looks}: expected 0 to {MOST_LIGHTS}")
     if options.record_looks and "front" not in options.record_cameras:
         raise InputError(f"{flag}looks: are those of the camera front, which is not recorded")
-    if options.record_looks and (shown := {"semantic", "visual"} & {*options.mode}):
+    if options.record_looks and (shown := [mode for mode in options.mode if modes.get(mode).looks]):
         raise InputError(
-            f"{flag}looks: belongs to modes base and execution, not {min(shown)}: none must learn its looks"
+            f"{flag}looks: belongs to modes without looks of their own, not {min(shown)}: none must learn its looks"
         )
     found = {}
     for name in options.record_cameras:
@@ -476,6 +487,8 @@ def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, 
 def _policy_options(options: RunOptions) -> JsonObject:
     """Arguments of a policy besides its spec."""
     scheme = options.policy.partition(":")[0]
+    if scheme == "process":
+        return {"timeout": options.remote_timeout, "labels": options.labels or "v3.1"}
     if scheme == "remote":
         return {
             "timeout": options.remote_timeout,

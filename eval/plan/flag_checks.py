@@ -68,7 +68,7 @@ def _check_belonging(options: Ray | RunOptions, group: type, flag: str, given: b
 
 def _check_policy(options: RunOptions) -> None:
     """Refuse flags of other policies."""
-    for name in () if options.policy.partition(":")[0] == "remote" else flags_of(Remote):
+    for name in set(flags_of(Remote)) - set(Remote.names_for(options.policy)):
         if getattr(options, name) != getattr(Remote, name):
             raise InputError(f"{flag_name(name)}: belongs to --policy remote:<url>, not {options.policy}")
 

@@ -53,7 +53,7 @@ class Tested:
     """Tasks, and the trackers and the policy that do them."""
 
     task: Several[str] = ()
-    """Task names, or `all`: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
+    """Task names, or `all`, the paper's: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
     tracker: Several[str] = ()
     """Trackers that execute the 40D action, one or several: twist2 (when none is named) sonic pd ..."""
     checkpoint: str | None = None
@@ -62,7 +62,7 @@ class Tested:
     policy: str = "expert"
     """Policy that decides it: expert, stand, learned (the one that comes with the package; learned:<folder of eval
     pack>), lerobot:<checkpoint or training>, replay:<clip, or actions of a run>, replay:<LeRobot
-    dataset>#<episode, or all>, remote:<url>."""
+    dataset>#<episode, or all>, remote:<url>, process:<command>."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Conditions:
     """Conditions under which tasks are done."""
 
     mode: Several[str] = ()
-    """Evaluation modes, one or several: base (when none is named) execution semantic visual, and the held-out looks
-    semantic-2 semantic-3. Modes with one scene (base execution visual) play in one batch of worlds."""
+    """Evaluation modes, one or several: base (when none is named) execution semantic visual, dynamics, and the held-out
+    looks semantic-2 semantic-3. Modes with one scene (base execution visual dynamics) play in one batch of worlds."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"
@@ -210,13 +210,18 @@ class Remote:
     """Requests to a policy server."""
 
     remote_timeout: float = 60.0
-    """For --policy remote: deadline of a request with all its attempts [s]."""
+    """For --policy remote and process: deadline of a request with all its attempts [s]."""
     remote_retries: int = 4
     """For --policy remote: repeated attempts after a connection error, with pauses of 0.25, 0.5, 1 ... s."""
     remote_sequential: bool = False
     """For --policy remote: ask for one world after the other, in their order."""
     remote_insecure: bool = False
     """For --policy remote: do not check the certificate of an https server."""
+
+    @staticmethod
+    def names_for(policy: str) -> tuple[str, ...]:
+        """Names of the flags that belong to a policy, which its spec names."""
+        return {"remote": flags_of(Remote), "process": ("remote_timeout",)}.get(policy.partition(":")[0], ())
 
 
 @dataclass(frozen=True)
@@ -238,12 +243,13 @@ class _Plan:
 class RunOptions(
     Remote, Output, Workers, Viewer, Recording, Pictures, Stepping, Batch, _Plan, Conditions, Chunks, Tested
 ):
-    """Evaluate a policy through a tracker on the seven tasks, and write tables and a report.
+    """Evaluate a policy through a tracker on tasks, and write tables and a report.
 
-    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve all seven tasks through
-    both trackers, a few episodes each (about two minutes on two CPU cores), the policy that comes with the package, if
-    one does, solves those that its card names through the first of them, and the report opens with film strips. As soon
-    as one of these flags is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20 repeats.
+    Without --task, --mode, --seeds, --repeats, --until-width and --max-steps the experts solve the paper's seven tasks
+    through both trackers, a few episodes each (about two minutes on two CPU cores), the policy that comes with the
+    package, if one does, solves those that its card names through the first of them, and the report opens with film
+    strips. As soon as one of these flags is given, the rest follows the benchmark's protocol: one tracker, 3 seeds x 20
+    repeats.
     """
 
     viewer_failures: bool = False

@@ -1,4 +1,4 @@
-"""Distances of an `interaction.Interaction`, measured in running worlds: of robot and hands to the things to touch."""
+"""Distances of a task's `Interaction`, measured in running worlds: of robot and hands to the things to touch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.interfaces import World
 from arena_newton.robot.rotations import atan2, heading, quat_apply, quat_conjugate, quat_multiply, wrap_angle
 from arena_newton.tasks.judge import bounding_box
@@ -26,7 +25,8 @@ class InteractionView:
         Raises:
             InputError: A prim is missing in the scene.
         """
-        self.spec = INTERACTIONS[env.spec.name]
+        assert env.spec.interaction is not None
+        self.spec = env.spec.interaction
         self.worlds, self._device, scene = env.worlds, env.torch_device, env.scene
         box = self.spec.box
         self.box = bounding_box(scene, box) if scene.has_body(box) else scene.marker(box)

@@ -45,10 +45,12 @@ from arena_newton.eval.play.run_flow import (
 )
 from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.episode_signals import EpisodeSignals
+from arena_newton.eval.records.identity import config_hash, own_code
 from arena_newton.eval.records.journal import SCHEMA, EpisodeLines, EpisodeRecord, StorageError
 from arena_newton.eval.reports import console
 from arena_newton.eval.reports.progress import kernels_to_compile
 from arena_newton.files.own_files import file_label
+from arena_newton.files.stored_json import is_name
 from arena_newton.files.text import counted, plain_text
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.viewing import FailureRecorder, WorldViewer
@@ -75,15 +77,24 @@ __all__ = [
 ]
 
 
+def _no_recorders(env: World) -> Sequence[Recorder]:
+    return ()
+
+
 @dataclass(frozen=True)
 class Factories:
-    """Constructors of a run's parts; tests put their own in."""
+    """Constructors of a run's parts, for a program that puts its own in (docs/research.md).
+
+    Other processes (`--jobs`) import them by module and name, so there they must not be of the program's main module.
+    """
 
     env: Callable[..., World] = ArenaEnv
     tracker: Callable[[str, Path | None], Tracker] = trackers.get
     policy: Callable[..., Policy] = policies.get
     check_variant: Callable[[Path, str], None] = validate.check
     """Raises InputError for a file that is not a scene of the task."""
+    recorders: Callable[[World], Sequence[Recorder]] = _no_recorders
+    """Recorders of an environment, made once for it; their metrics are in the journal (`EpisodeResult.extra`)."""
 
 
 def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:
@@ -298,6 +309,8 @@ class RunPlayer:
         try:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
             own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()} | shown_by(config.cameras)
+            research = self.factories.recorders(env)
+            own |= {"recorders": config_hash(sorted({own_code(one) or "" for one in research}))} if research else {}
             for names in groups(order):
                 facts = self.folder.register(" ".join(names), own)
             if flags.verbose:
@@ -319,7 +332,7 @@ class RunPlayer:
                 from arena_newton.eval.play import recording  # its codecs, for which other runs do not wait
 
                 noise = recording.disturbance_of(config, task, episodes[0].max_steps)
-            recorders += [] if noise is None else [noise]
+            recorders += [*([] if noise is None else [noise]), *research]
             if config.recording is not None:
                 described = recording.facts_of(config, task, tracker, mode, facts, self.folder.installed)
                 files = recording.demonstration_recorder(config, self.folder.path, described)
@@ -440,6 +453,13 @@ def _viewer(config: RunConfig, folder: Path) -> WorldViewer | None:
     return viewer
 
 
+def _metric(name: str, value: float) -> float:
+    """A metric as the journal keeps it."""
+    if not is_name(name) or not math.isfinite(value):
+        raise InputError(f"recorder: metric {plain_text(name, 80)} is {value}, expected a finite number with a name")
+    return float(value)
+
+
 def _record(
     result: EpisodeResult,
     media: dict[str, str],
@@ -475,6 +495,7 @@ def _record(
         progress=float(result.progress),
         events=tuple(result.events),
         signals=signals,
+        extra={name: _metric(name, value) for name, value in result.extra.items()},
         actions=evidence.get("actions"),
         final_state=evidence.get("final_state"),
         shown=evidence.get("shown"),

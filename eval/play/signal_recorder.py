@@ -59,7 +59,7 @@ class SignalRecorder(Recorder):
         self._legs = torch.tensor(list(LEGS), device=device)
         self._reference = wp.to_torch(env.loop.reference.position)
         self._camera: Camera | None = None
-        self._shapes = shapes_of(env, self.spec.sight)
+        self._shapes = shapes_of(env, self.spec.sight or env.spec.target)
         self._ended: dict[int, EpisodeSignals] = {}
         worlds = env.worlds
         self._now = {name: torch.full((worlds,), value, device=device) for name, value in _BEGIN.items()}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import importlib
 import inspect
 import json
 import os
@@ -14,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import arena_newton
 from arena_newton.errors import InputError
-from arena_newton.rules.rule_types import HELD_OUT
+from arena_newton.rules import modes as all_modes
 
 if TYPE_CHECKING:
     from arena_newton.files.stored_json import JsonObject
+    from arena_newton.rules.rule_types import RuleSet
     from arena_newton.tasks import TaskSpec
 
 __all__ = [
@@ -32,6 +35,7 @@ __all__ = [
     "hash_path",
     "hash_paths",
     "layers_hash",
+    "mode_facts",
     "moving_versions",
     "own_code",
     "package_files",
@@ -157,11 +161,13 @@ def package_files(root: Path) -> list[Path]:
 def code_files(root: Path = PACKAGE) -> list[Path]:
     """Modules of a package folder whose change may change a result: all but `UNHASHED` and command lines."""
 
-    def counts(file: Path) -> bool:
-        rooms = (part.as_posix() for part in file.relative_to(root).parents)
-        return file.suffix == ".py" and file.name != "__main__.py" and not any(room in UNHASHED for room in rooms)
+    @functools.cache
+    def counts(folder: Path) -> bool:
+        room = folder.relative_to(root)
+        return not any(part.as_posix() in UNHASHED for part in (room, *room.parents))
 
-    return [file for file in package_files(root) if counts(file)]
+    modules = (file for file in package_files(root) if file.suffix == ".py" and file.name != "__main__.py")
+    return [file for file in modules if counts(file.parent)]
 
 
 def code_hash(root: Path = PACKAGE) -> str:
@@ -181,7 +187,7 @@ def scene_files(root: Path, tasks: Collection[str], known: Collection[str], mode
     Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`, nor what is
     named after a held-out mode that is not among `modes`.
     """
-    others, unplayed = {"lab", *known} - set(tasks), set(HELD_OUT) - set(modes)
+    others, unplayed = {"lab", *known} - set(tasks), set(all_modes.HELD_OUT) - set(modes)
     scenes = root / "usd_scenes"
 
     def counts(file: Path) -> bool:
@@ -210,12 +216,27 @@ def layers_hash(stage: Path) -> str:
 
 
 def foreign_task(spec: TaskSpec) -> JsonObject:
-    """Hashes of a task's scene, with all that it names, and of the package of its judge and sampler, unless ours."""
-    codes = {code for part in (spec.judge, spec.sample) if (code := own_code(part)) is not None}
-    facts: JsonObject = {"code": config_hash(sorted(codes))} if codes else {}
+    """Hashes of a task's scene, with all that it names, and of the packages of judge, sampler and expert, unless ours.
+
+    A kernel is hashed with the package of the judge that launches it.
+    """
+    codes = {own_code(spec.judge), own_code(spec.sample)}
+    if spec.expert is not None:
+        codes.add(_package_code(spec.expert.partition(":")[0]))
+    codes.discard(None)
+    facts: JsonObject = {"code": config_hash(sorted(filter(None, codes)))} if codes else {}
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
     return facts
+
+
+def mode_facts(name: str, rules: RuleSet, tasks: Collection[str]) -> JsonObject:
+    """Hashes of a mode's ranges for some tasks, and of the package of its functions, unless the rules hold them all."""
+    mode = all_modes.get(name)
+    if name in all_modes.BUILT_IN and not mode.dynamics:
+        return {}
+    codes = {code for part in (mode.placements, mode.light) if part and (code := own_code(part)) is not None}
+    return {"ranges": mode.hash_for(rules, tasks)} | ({"code": config_hash(sorted(codes))} if codes else {})
 
 
 def own_code(part: object) -> str | None:
@@ -226,11 +247,18 @@ def own_code(part: object) -> str | None:
     """
     if isinstance(part, functools.partial):
         part = part.func
-    module = sys.modules.get((part if inspect.isclass(part) or inspect.isroutine(part) else type(part)).__module__)
-    name = module.__name__.partition(".")[0] if module is not None else ""
-    if name in {"", "arena_newton", *sys.stdlib_module_names}:
+    return _package_code((part if inspect.isclass(part) or inspect.isroutine(part) else type(part)).__module__)
+
+
+def _package_code(path: str) -> str | None:
+    """Hash of the package that a module is in, or of the single module; None for ours and Python's."""
+    name = path.partition(".")[0]
+    if name in {"arena_newton", *sys.stdlib_module_names}:
         return None
-    top = sys.modules.get(name)
+    if getattr(sys.modules.get(name), "__file__", None) is None:
+        with contextlib.suppress(Exception):  # who plays an expert says why it does not load
+            importlib.import_module(path)
+    module, top = sys.modules.get(path), sys.modules.get(name)
     whole = getattr(top, "__file__", None) is not None  # not so of a namespace, which other packages may be in too
     file = getattr(top if whole else module, "__file__", None)
     if file is None:

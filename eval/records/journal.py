@@ -125,6 +125,8 @@ class EpisodeRecord:
     """Single events of the episode, in the order of its ticks."""
     signals: Annotated[EpisodeSignals | None, Fit("the signals of an episode")] = None
     """Signals that tell why it failed; None, and absent in the line, without `eval run --failures`."""
+    extra: Annotated[dict[Name, float], Fit("numbers by name")] = field(default_factory=dict)
+    """Metrics of recorders (`Factories.recorders`) by name; absent in the line where there are none."""
     actions: FileHash = None
     """SHA-256 of the arrays in the file of its actions, `media.actions` (`untrusted_files.array_digest`); None, and
     absent in the line, as the next two, where no actions are kept."""
@@ -147,7 +149,7 @@ class EpisodeRecord:
         values["events"] = [dataclasses.asdict(event) for event in self.events]
         if self.signals is not None:
             values["signals"] = dataclasses.asdict(self.signals)
-        absent = {"privileged": not self.privileged}
+        absent = {"privileged": not self.privileged, "extra": not self.extra}
         absent |= {name: values[name] is None for name in ("signals", *EVIDENCE, "previous")}
         return {key: value for key, value in values.items() if not absent.get(key)}
 

@@ -77,10 +77,12 @@ def page(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     reasons: Sequence[ErrorReason],
+    metrics: str = "",
 ) -> str:
     """The page as text, the same for the same content byte for byte.
 
-    `head` and `rows` are the table, a row per cell, then a row per suite; `notes` what a reader must know besides it.
+    `head` and `rows` are the table, a row per cell, then a row per suite; `notes` what a reader must know besides it;
+    `metrics` is the table of recorders' metrics.
     """
     document, records = run.document, run.records
     shown, folded = _strips(records)
@@ -103,6 +105,7 @@ def page(
         stages=SENTENCES,
         failures=stage_bars(results.get("failures", [])),
         reasons=reasons,
+        metrics=metrics,
         opening=[(_Episode(record), strip) for record, strip in opening],
         shown=[_Episode(record) for record in shown],
         folded=[_Episode(record) for record in folded],

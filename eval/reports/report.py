@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 from arena_newton.eval.folders.original_format import ORIGINAL, original_files, write_original
 from arena_newton.eval.folders.results import Results, RunRecord, changed_conditions, results_json, width_rule
@@ -17,7 +18,7 @@ from arena_newton.pages.tables import Table, between, escaped, percent
 from arena_newton.robot.g1 import TICK
 from arena_newton.tasks.semantic_mode import semantic_notes
 
-__all__ = ["derived_files", "notes", "original_of", "table", "write_reports"]
+__all__ = ["derived_files", "metrics", "notes", "original_of", "table", "write_reports"]
 
 _COLUMNS = """task tracker policy mode episodes successes falls startup_falls timeouts errors
     sr sr_seed_std ci95_low ci95_high afr mean_steps""".split()
@@ -39,6 +40,7 @@ def _cell_text(cell: ResultCell) -> list[str]:
 
 
 _HEAD = ["task", "tracker", "policy", "mode", "n", "SR % ± seed std", "95 % CI", "AFR %"]
+METRICS = ["task", "tracker", "policy", "mode", "metric", "n", "mean ± std", "range"]
 _HEAD += ["falls running + at start", "timeouts", "errors", "mean steps"]
 
 
@@ -62,7 +64,18 @@ def _rows(results: Results) -> list[list[str]]:
 
 def table(results: Results) -> str:
     """The result table as Markdown with aligned columns; it is also what the command line prints."""
-    return Table(_HEAD, _rows(results), "llllr").markdown()
+    return Table(_HEAD, _rows(results), "llllr").markdown() + metrics(results["cells"])
+
+
+def metrics(cells: Sequence[ResultCell]) -> str:
+    """Table of recorders' metrics as Markdown below an empty line; an empty text where there are none."""
+    rows = [
+        [*map(plain, (cell["task"], cell["tracker"], cell["policy"], cell["mode"], name)), str(found["episodes"])]
+        + [f"{found['mean']:.4g} ± {found['std']:.4g}", f"{found['least']:.4g} to {found['most']:.4g}"]
+        for cell in cells
+        for name, found in cell.get("extra", {}).items()
+    ]
+    return "\n" + Table(METRICS, rows, "lllllr").markdown() if rows else ""
 
 
 def table_csv(results: Results) -> str:
@@ -170,7 +183,9 @@ def _markdown(run: RunRecord, results: Results) -> str:
 
 def _html(run: RunRecord, results: Results) -> str:
     reasons = error_reasons(run.records)
-    return html_report.page(run, results, notes=notes(run, results), head=_HEAD, rows=_rows(results), reasons=reasons)
+    measured, rows = metrics(results["cells"]).lstrip(), _rows(results)
+    found = notes(run, results)
+    return html_report.page(run, results, notes=found, head=_HEAD, rows=rows, reasons=reasons, metrics=measured)
 
 
 def write_reports(run: RunRecord) -> Results:

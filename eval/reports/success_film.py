@@ -79,7 +79,7 @@ def write(runs: Sequence[RunRecord], target: Path, seconds: float, width: int, m
     except OSError as error:
         raise StorageError(f"{target}: cannot be written ({error.strerror or error})") from None
     lines = [f"{_caption(record)}: {path}" for record, path in chosen]
-    absent = [name for name in tasks.names() if name not in {record.task for record, _ in chosen}]
+    absent = [name for name in tasks.PAPER if name not in {record.task for record, _ in chosen}]
     lines += [f"no recorded success of {' '.join(absent)}"] if absent else []
     return [*lines, f"{target}: {counted(len(chosen), 'task')}, {target.stat().st_size / 1e6:.2f} MB"]
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from arena_newton import tasks as specs
 from arena_newton.cli.flags import shell_command, typed
-from arena_newton.eval.plan.options import Remote, flags_of
+from arena_newton.eval.plan.options import Remote
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.files.stored_json import Json
@@ -31,8 +31,6 @@ MEDIA = {"ego strip": "head camera", "world strip": "world camera", "ego": "head
 """Media of an episode that the page knows → what they show."""
 REPLAYED = ("policy", "checkpoint", "labels", "replan", "rules", "drive", "engine", "device", "variant", "max_steps")
 """Flags with a value on which an episode depends, besides its task, tracker, mode, seed and repeat."""
-REMOTE = {name: getattr(Remote, name) for name in flags_of(Remote)}
-"""Flags that belong to a policy server → their defaults; others are named in the command."""
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}"
 _PATH = re.compile(rf"videos/{_NAME}\.mp4|strips/{_NAME}\.(?:png|jpg)")
@@ -63,8 +61,8 @@ def replay_command(options: Mapping[str, Json], record: EpisodeRecord, worlds: o
     else:
         given |= {"seeds": record.group_seed, "repeats": record.repeat + 1}
     given |= {name: options.get(name) for name in REPLAYED if options.get(name) not in ("", "auto")}
-    for name, default in REMOTE.items() if plain(options.get("policy")).startswith("remote:") else ():
-        value = options.get(name, default)
+    for name in Remote.names_for(plain(options.get("policy"))):
+        value = options.get(name, default := getattr(Remote, name))
         given |= {name: value} if value is not False and value != default else {}
     given |= {
         "latency_ticks": options.get("latency_ticks") or None,

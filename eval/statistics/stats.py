@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 from arena_newton import tasks
 from arena_newton.cli import intervals
@@ -21,6 +21,7 @@ __all__ = [
     "ResultCell",
     "ErrorReason",
     "Figures",
+    "MetricFigures",
     "PairedRates",
     "PooledFigures",
     "Suite",
@@ -44,6 +45,17 @@ type Outcomes = Mapping[Hashable, bool]
 """Event (a success, a fall) in each episode: True if it happened, by the episode's name in both of two conditions."""
 
 
+class MetricFigures(TypedDict):
+    """Figures of a recorder's metric, over the episodes that have it."""
+
+    episodes: int
+    mean: float
+    std: float | None
+    """Population standard deviation."""
+    least: float
+    most: float
+
+
 class Figures(TypedDict):
     """Figures of some episodes, as in results.json."""
 
@@ -65,6 +77,8 @@ class Figures(TypedDict):
     """Average fall rate."""
     mean_steps: float | None
     """Over the episodes without error [ticks]."""
+    extra: NotRequired[dict[str, MetricFigures]]
+    """Metrics of recorders by name; absent where no episode has one."""
 
 
 class ResultCell(Figures):
@@ -117,7 +131,7 @@ def suites() -> dict[str, tuple[str, ...]]:
 
     `outside_suites` names other tasks.
     """
-    named = {suite: tuple(t for t in tasks.names() if tasks.get(t).suite == suite) for suite in ("HOI", "HSI")}
+    named = {suite: tuple(t for t in tasks.PAPER if tasks.get(t).suite == suite) for suite in ("HOI", "HSI")}
     return {f"{suite}_AVG": names for suite, names in named.items()} | {"ALL_AVG": named["HOI"] + named["HSI"]}
 
 
@@ -173,7 +187,7 @@ def cell(records: Sequence[EpisodeRecord]) -> Figures:
     episodes, successes, falls = len(outcomes), outcomes.count("success"), outcomes.count("fall")
     rates = seed_rates(records)
     steps = [record.steps for record in records if record.outcome != "error"]
-    return {
+    figures: Figures = {
         "episodes": episodes,
         "successes": successes,
         "falls": falls,
@@ -189,6 +203,15 @@ def cell(records: Sequence[EpisodeRecord]) -> Figures:
         "afr": falls / episodes if episodes else None,
         "mean_steps": math.fsum(steps) / len(steps) if steps else None,
     }
+    metrics = {name: _metric(records, name) for name in sorted({name for record in records for name in record.extra})}
+    return figures | {"extra": metrics} if metrics else figures
+
+
+def _metric(records: Iterable[EpisodeRecord], name: str) -> MetricFigures:
+    """Figures of a metric over the episodes that have it, one at least."""
+    values = [record.extra[name] for record in records if name in record.extra]
+    mean, least, most = math.fsum(values) / len(values), min(values), max(values)
+    return {"episodes": len(values), "mean": mean, "std": population_std(values), "least": least, "most": most}
 
 
 def pooled(records_by_task: Mapping[str, Sequence[EpisodeRecord]], names: Sequence[str]) -> PooledFigures | None:

@@ -27,8 +27,8 @@ MATCHED_SPREAD = 0.13
 """Standard deviation between trainings of a rate through the tracker of the training.
 
 This and the next two are declared where fewer than `ENOUGH` trainings of a recipe say theirs. Pooled over the eight
-cells of three trainings in docs/results/README.md, "One training is one sample", which differ in steps and in part in
-demonstrations and code too, so they are rough, and rather too large than too small."""
+cells of three trainings in docs/results/trainings.md, "One training is one sample", which differ in steps and in part
+in demonstrations and code too, so they are rough, and rather too large than too small."""
 SWAPPED_SPREAD = 0.26
 """Spread of a rate through another tracker."""
 DROP_SPREAD = 0.28

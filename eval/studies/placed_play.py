@@ -152,5 +152,5 @@ class PlacedWorlds:
     def _samples(self, placed: Planned) -> dict[str, dict[str, float]]:
         assert isinstance(placed, PlacedEpisode)
         mode = self.config.flags.mode[0]
-        drawn = self._spec.sample(placed.episode_seed, mode, self._rules)
+        drawn = self._spec.drawn(placed.episode_seed, mode, self._rules)
         return moved(drawn, self.axes, placed.values, self._rules, mode)

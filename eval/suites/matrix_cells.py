@@ -14,7 +14,7 @@ from pathlib import Path
 from arena_newton import policies, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
-from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.plan.options import Remote, RunOptions, flags_of
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.eval.reports.progress import simulated
 from arena_newton.eval.suites.suite_file import SELECTORS, PolicyEntry, Selector, SuiteFile
@@ -110,7 +110,7 @@ def _cell(
     return SuiteCell(
         id=name,
         policy=entry.name,
-        family=entry.family or ("" if scheme in (CHECKPOINTS, "remote") else scheme),
+        family=entry.family or ("" if scheme in (CHECKPOINTS, "process", "remote") else scheme),
         spec=spec,
         trained_on=trained_on,
         trained_tasks=learned,
@@ -295,7 +295,7 @@ def _checkpoint(argument: str) -> Path:
 
 def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: CheckpointFacts) -> SuiteCell:
     """A cell held to what its checkpoint says of its training."""
-    names = {tasks.get(name).gym_id: name for name in tasks.names()}
+    names = {spec.gym_id: spec.name for spec in tasks.specs()}
     learned, path = tuple(names.get(task, task) for task in facts.tasks), cell.spec.partition(":")[2]
     claims = (
         ("labels", (entry.labels,) if entry.labels else (), (facts.labels,)),
@@ -322,10 +322,8 @@ def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: Checkpoi
 def run_options(suite: SuiteFile, cell: SuiteCell, out: Path, device: str | None = None) -> RunOptions:
     """The flags of `eval run` for a cell."""
     entry = next(entry for entry in suite.policies if entry.name == cell.policy)
-    scheme = cell.spec.partition(":")[0]
-    flags: JsonObject = {
-        key: v for key, v in suite.defaults.items() if scheme == "remote" or not key.startswith("remote_")
-    }
+    scheme, others = cell.spec.partition(":")[0], set(flags_of(Remote)) - set(Remote.names_for(cell.spec))
+    flags: JsonObject = {key: value for key, value in suite.defaults.items() if key not in others}
     flags |= {
         "task": (cell.task,),
         "tracker": (cell.tracker,),

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, changed_conditions, due_episodes
-from arena_newton.eval.statistics.stats import wilson
+from arena_newton.eval.reports.report import metrics
+from arena_newton.eval.statistics.stats import aggregate, wilson
 from arena_newton.eval.tables.episode_table import (
     NAMED,
     EvaluatedCell,
@@ -22,7 +23,7 @@ from arena_newton.eval.tables.episode_table import (
 from arena_newton.eval.tables.table_entries import ordered
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules.modes import names as mode_names
 from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["joint_table"]
@@ -44,7 +45,7 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     _check_unique(found)
     policies = list(dict.fromkeys(policy for policy, _ in found))
     used = dict.fromkeys(cell.tracker for _, cell in found)
-    modes = ordered({cell.mode for _, cell in found}, MODES)
+    modes = ordered({cell.mode for _, cell in found}, mode_names())
     cells: dict[tuple[str, ...], list[bool]] = {}
     for policy, cell in found:
         for task in (cell.task, ALL):
@@ -59,7 +60,8 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     head = ["task", "tracker", *(["policy"] if len(policies) > 1 else []), *modes]
     table = Table(head, rows, "l" * (len(head) - len(modes)) + "r").markdown()
     notes = "".join(f"{note}\n" for note in _notes(runs, [cell for _, cell in found]))
-    return f"{table}\n{_conditions(runs, policies, weights)}\n{notes}"
+    measured = metrics([found for run in runs for found in aggregate(run.records)["cells"]])
+    return f"{table}\n{_conditions(runs, policies, weights)}\n{notes}{measured}"
 
 
 def _policy(cell: EvaluatedCell) -> str:

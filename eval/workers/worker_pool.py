@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 import os
+import pickle
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing.reduction import ForkingPickler
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import ArenaError, InputError
@@ -22,6 +25,7 @@ from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.workers.backend import PoolBackend, Process, WorkerLost
+from arena_newton.eval.workers.local_backend import LocalBackend
 from arena_newton.eval.workers.messages import Broke, Done, EpisodeBatch, Event, Node, Opened
 from arena_newton.files.text import counted, plain_text
 
@@ -138,8 +142,6 @@ def backend_of(flags: Workers, device: str) -> Iterator[PoolBackend]:
         InputError: No cluster answers, or it has no room.
     """
     if flags.ray is None:
-        from arena_newton.eval.workers.local_backend import LocalBackend
-
         yield LocalBackend(flags.jobs, device)
         return
     os.environ["RAY_ENABLE_UV_RUN_RUNTIME_ENV"] = "0"  # read on import: each process would be another `uv run`
@@ -161,6 +163,8 @@ class WorkerPool:
             factories: What they build runs with; the real parts by default.
         """
         self.backend, self._most, self._factories = backend, most, factories
+        if isinstance(backend, LocalBackend):
+            _check_importable(factories, backend.flag)
         self.workers: list[Worker] = []
         self.shown: Progress | None = None
         """Progress that shows losses."""
@@ -354,6 +358,23 @@ class WorkerPool:
     def _late(self) -> float:
         """Deadline of a process that begins something now [s]."""
         return time.monotonic() + 60.0 * self.backend.minutes
+
+
+def _check_importable(factories: Factories | None, flag: str) -> None:
+    """Refuse parts of a run that another process of this machine cannot import.
+
+    Raises:
+        InputError: One is of the program that was started, or of no module.
+    """
+    for name, part in vars(factories).items() if factories is not None else ():
+        made = part.func if isinstance(part, functools.partial) else part
+        try:
+            ForkingPickler.dumps(part)
+            importable = getattr(made, "__module__", type(made).__module__) != "__main__"
+        except (AttributeError, TypeError, pickle.PicklingError):
+            importable = False
+        if not importable:
+            raise InputError(f"{flag}: Factories.{name} is {made!r}; other processes import it by module and name")
 
 
 def _error(message: Broke) -> ArenaError | None:

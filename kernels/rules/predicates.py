@@ -1,4 +1,4 @@
-"""Predicates on the way to success: which of a task's predicates hold at this tick, all of them in one launch.
+"""Conditions, and what is made of them: the predicates on the way to success, and success where it is a conjunction.
 
 A predicate is the conjunction of conditions, each of which compares one measured quantity with a limit. Points and
 boxes are fixed to bodies. Nothing here is differentiable; the margins in `success` are.
@@ -8,10 +8,11 @@ boxes are fixed to bodies. Nothing here is differentiable; the margins in `succe
 
 import warp as wp
 
-from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation
+from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation, count_up
 from arena_newton.kernels.launching import launch
 
-__all__ = ["ANGLE", "AWAY", "CLEAR", "MARGIN", "NEAR", "TERM", "TOWARD", "UNLATCHED", "launch_predicates"]
+__all__ = ["ANGLE", "AWAY", "CLEAR", "MARGIN", "NEAR", "SLOW", "TERM", "TOWARD", "UNLATCHED", "UPRIGHT"]
+__all__ += ["launch_conditions", "launch_predicates"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,8 +30,12 @@ UNLATCHED = wp.constant(5)
 """The door's latch is released."""
 MARGIN = wp.constant(6)
 """The success condition holds at this instant."""
+SLOW = wp.constant(7)
+"""A free body moves with at most `limit` [m/s]."""
+UPRIGHT = wp.constant(8)
+"""A body's z-axis points up: the cosine of its tilt is at least `limit`."""
 KINDS = {"near": NEAR, "clear": CLEAR, "angle": ANGLE, "toward": TOWARD, "away": AWAY, "unlatched": UNLATCHED}
-KINDS["margin"] = MARGIN
+KINDS |= {"margin": MARGIN, "slow": SLOW, "upright": UPRIGHT}
 """Name of a condition's kind → its number."""
 
 TERM = ("kind", "horizontal", "address", "first_point", "end_point", "first_box", "end_box")
@@ -59,6 +64,58 @@ def distance_to_box(v: wp.vec3, half: wp.vec3, horizontal: int) -> float:
     return wp.length(outside) + inside
 
 
+@wp.func
+def measured(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    latched: wp.array[int],
+    margin: wp.array[float],
+    terms: wp.array2d[int],
+    point_body: wp.array[int],
+    point_pos: wp.array[wp.vec3],
+    boxes: Boxes,
+    w: int,
+    t: int,
+) -> float:
+    """Quantity that condition `t` compares with its limit, in the unit of its kind."""
+    kind = terms[t, 0]
+    horizontal = terms[t, 1]
+    address = terms[t, 2]
+    p0 = terms[t, 3]
+    b0 = terms[t, 5]
+    if kind == NEAR or kind == CLEAR:
+        nearest = float(FAR)
+        for p in range(p0, terms[t, 4]):
+            body = point_body[p]
+            point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
+            for b in range(b0, terms[t, 6]):
+                offset = point - box_centre(xpos, xquat, boxes, w, b)
+                v = wp.quat_rotate_inv(box_rotation(xquat, boxes, w, b), offset)
+                nearest = wp.min(nearest, distance_to_box(v, boxes.half[b], horizontal))
+        return nearest
+    if kind == ANGLE:
+        return wp.abs(qpos[w, address])
+    if kind == UNLATCHED:
+        return -float(latched[w])
+    if kind == MARGIN:
+        return margin[w]
+    if kind == SLOW:
+        return wp.length(level(wp.vec3(qvel[w, address], qvel[w, address + 1], qvel[w, address + 2]), horizontal))
+    body = point_body[p0]
+    turn = body_rotation(xquat, w, body)
+    if kind == UPRIGHT:
+        return wp.quat_rotate(turn, wp.vec3(0.0, 0.0, 1.0))[2]
+    point = body_position(xpos, w, body) + wp.quat_rotate(turn, point_pos[p0])
+    goal = wp.normalize(level(box_centre(xpos, xquat, boxes, w, b0) - point, horizontal))
+    if kind == TOWARD:
+        v = wp.vec3(qvel[w, address], qvel[w, address + 1], qvel[w, address + 2])
+        return wp.dot(level(v, horizontal), goal)
+    ahead = level(wp.quat_rotate(turn, wp.vec3(1.0, 0.0, 0.0)), horizontal)
+    return -wp.dot(wp.normalize(ahead), goal)
+
+
 @wp.kernel
 def predicates_kernel(
     xpos: wp.array3d[float],
@@ -84,44 +141,46 @@ def predicates_kernel(
     every = int(1)
     for t in range(first[k], first[k + 1]):
         kind = terms[t, 0]
-        horizontal = terms[t, 1]
-        address = terms[t, 2]
-        p0 = terms[t, 3]
-        b0 = terms[t, 5]
-        limit = limits[t]
-        ok = int(0)
-        if kind == NEAR or kind == CLEAR:
-            nearest = float(FAR)
-            for p in range(p0, terms[t, 4]):
-                body = point_body[p]
-                point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
-                for b in range(b0, terms[t, 6]):
-                    offset = point - box_centre(xpos, xquat, boxes, w, b)
-                    v = wp.quat_rotate_inv(box_rotation(xquat, boxes, w, b), offset)
-                    nearest = wp.min(nearest, distance_to_box(v, boxes.half[b], horizontal))
-            if kind == NEAR:
-                ok = wp.where(nearest <= limit, 1, 0)
-            else:
-                ok = wp.where(nearest > limit, 1, 0)
-        elif kind == ANGLE:
-            ok = wp.where(wp.abs(qpos[w, address]) >= limit, 1, 0)
-        elif kind == TOWARD or kind == AWAY:
-            body = point_body[p0]
-            turn = body_rotation(xquat, w, body)
-            point = body_position(xpos, w, body) + wp.quat_rotate(turn, point_pos[p0])
-            goal = level(box_centre(xpos, xquat, boxes, w, b0) - point, horizontal)
-            if kind == TOWARD:
-                v = wp.vec3(qvel[w, address], qvel[w, address + 1], qvel[w, address + 2])
-                ok = wp.where(wp.dot(level(v, horizontal), wp.normalize(goal)) >= limit, 1, 0)
-            else:
-                ahead = level(wp.quat_rotate(turn, wp.vec3(1.0, 0.0, 0.0)), horizontal)
-                ok = wp.where(-wp.dot(wp.normalize(ahead), wp.normalize(goal)) >= limit, 1, 0)
-        elif kind == UNLATCHED:
-            ok = wp.where(latched[w] == 0, 1, 0)
-        elif kind == MARGIN:
-            ok = wp.where(margin[w] >= 0.0, 1, 0)
+        value = measured(xpos, xquat, qpos, qvel, latched, margin, terms, point_body, point_pos, boxes, w, t)
+        ok = wp.where(value >= limits[t], 1, 0)
+        if kind == NEAR or kind == SLOW:
+            ok = wp.where(value <= limits[t], 1, 0)
+        elif kind == CLEAR:
+            ok = wp.where(value > limits[t], 1, 0)
         every = wp.min(every, ok)
     predicates[w, k] = every
+
+
+@wp.kernel
+def conditions_kernel(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    latched: wp.array[int],
+    ticks: int,
+    terms: wp.array2d[int],
+    limits: wp.array[float],
+    point_body: wp.array[int],
+    point_pos: wp.array[wp.vec3],
+    boxes: Boxes,
+    counter: wp.array[int],
+    success: wp.array[int],
+    margin: wp.array[float],
+):
+    """One thread per world: all conditions hold, `ticks` in a row; the margin is the smallest slack of them."""
+    w = wp.tid()
+    m = float(FAR)
+    for t in range(terms.shape[0]):
+        value = measured(xpos, xquat, qpos, qvel, latched, margin, terms, point_body, point_pos, boxes, w, t)
+        slack = value - limits[t]
+        if terms[t, 0] == NEAR or terms[t, 0] == SLOW:
+            slack = -slack
+        m = wp.min(m, slack)
+    count = count_up(m, counter[w])
+    counter[w] = count
+    margin[w] = m
+    success[w] = wp.where(count >= ticks, 1, 0)
 
 
 def launch_predicates(
@@ -160,3 +219,32 @@ def launch_predicates(
     state = [xpos, xquat, qpos, qvel, latched, success, margin]
     conditions = [first, terms, limits, point_body, point_pos, boxes]
     launch(predicates_kernel, predicates.shape, [*state, *conditions], [predicates])
+
+
+def launch_conditions(
+    xpos: wp.array,
+    xquat: wp.array,
+    qpos: wp.array,
+    qvel: wp.array,
+    latched: wp.array,
+    *,
+    ticks: int,
+    terms: wp.array,
+    limits: wp.array,
+    point_body: wp.array,
+    point_pos: wp.array,
+    boxes: Boxes,
+    counter: wp.array,
+    success: wp.array,
+    margin: wp.array,
+) -> None:
+    """Success of a task that is one conjunction of conditions.
+
+    Arguments that `launch_predicates` and `success` describe are not repeated.
+
+    Args:
+        ticks: Ticks in a row for which all must hold.
+    """
+    state = [xpos, xquat, qpos, qvel, latched, ticks]
+    conditions = [terms, limits, point_body, point_pos, boxes]
+    launch(conditions_kernel, success.shape, [*state, *conditions], [counter, success, margin])

@@ -178,7 +178,7 @@ class Expert:
 
 def solved_tasks() -> list[str]:
     """Tasks that name an expert, sorted."""
-    return sorted(name for name in task_registry.names() if task_registry.get(name).expert)
+    return sorted(spec.name for spec in task_registry.specs() if spec.expert)
 
 
 def expert_class(task: str) -> type[Expert]:

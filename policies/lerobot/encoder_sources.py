@@ -157,7 +157,7 @@ def made_clip(sizes: Mapping[str, int], picture: int, tokens: int, tokenizer: Pr
 
 
 def made_tokenizer(vocabulary: int = VOCABULARY) -> PreTrainedTokenizerFast:
-    """A tokenizer of bytes, with the words of all tasks' instructions: every text can be read."""
+    """A tokenizer of bytes, with the words of the paper's instructions: every text can be read."""
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
@@ -167,7 +167,7 @@ def made_tokenizer(vocabulary: int = VOCABULARY) -> PreTrainedTokenizerFast:
         initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
         show_progress=False,
     )
-    tokenizer.train_from_iterator([tasks.get(name).instruction for name in tasks.names()], trainer)
+    tokenizer.train_from_iterator([tasks.get(name).instruction for name in tasks.PAPER], trainer)
     ends = [(_BEGIN, tokenizer.token_to_id(_BEGIN)), (_END, tokenizer.token_to_id(_END))]
     tokenizer.post_processor = processors.TemplateProcessing(single=f"{_BEGIN} $A {_END}", special_tokens=ends)
     return PreTrainedTokenizerFast(

@@ -13,6 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -97,11 +98,13 @@ def pack_begun(facts: ServedFacts) -> bytes:
     return _dumped({"ok": True, "seeded": facts.seeded, "policy": facts.policy})
 
 
-def pack_query(query: Query) -> bytes:
-    """Body of `/infer`."""
+def pack_query(query: Query, files: Mapping[str, Path] | None = None) -> bytes:
+    """Body of `/infer`; pictures in it, or in PNG files by the names of their cameras."""
     seen: dict[str, object] = {"state": [float(v) for v in query.state]}
     if query.images:
         seen["images"] = {name: _packed(np.asarray(image)) for name, image in query.images.items()}
+    if files:
+        seen["images"] = {name: {"file": str(path)} for name, path in files.items()}
     content: dict[str, object] = {"observation": seen, "robot_type": query.robot_type, "return_chunk": True}
     content |= {"task": query.task, "instruction": query.instruction}
     more = {"world": int(query.session) if query.session else None, "step": query.step, "seed": query.seed}

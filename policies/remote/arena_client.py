@@ -1,7 +1,7 @@
 """The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
 
 A server of that protocol knows one robot only, so there is one request per world. `from_spec` also knows the protocols
-of other servers (docs/serving.md), each in its own module `remote_*`.
+of other servers (docs/asking_servers.md), each in its own module `remote_*`.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
         try:
             return read_facts(content if isinstance(content, dict) else {}, f"{self.url}/config")
         except WireError as error:
-            raise InputError(f"--policy remote: {self.masked(str(error))}") from None
+            raise InputError(f"--policy {self.name}: {self.masked(str(error))}") from None
 
     def _connect(self) -> _Connection:
         server = (self.address.host, self.address.port)
@@ -233,8 +233,9 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
             raise RemoteError(f"{where}: the reply is not JSON") from error
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
-            text = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            raise RemoteError(f"{where}: status {status}{text}", silent=silent, lost=episode_lost(text))
+            text = self.one_line(message) if isinstance(message, str) else ""
+            known = ", ".join(filter(None, [f"status {status}" if status != 200 or not text else "", text]))
+            raise RemoteError(f"{where}: {known}", silent=silent, lost=episode_lost(text))
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

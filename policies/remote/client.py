@@ -27,7 +27,14 @@ from arena_newton.policies.base import Chunk, Json, Mask, Observation, Policy, P
 from arena_newton.policies.protocols.handshake import RATE, ServedFacts, compare_facts, expected_facts
 from arena_newton.policies.protocols.policy_messages import LONGEST_CHUNK, Begin, Query
 from arena_newton.policies.protocols.wire_error import WireError
-from arena_newton.policies.remote.address import TOKEN_VARIABLE, cause, one_line, read_address, read_token
+from arena_newton.policies.remote.address import (
+    TOKEN_VARIABLE,
+    ServerAddress,
+    cause,
+    one_line,
+    read_address,
+    read_token,
+)
 from arena_newton.policies.remote.link import RemoteError, ServerLink
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION, STATE, STATE_WIDTH
 
@@ -91,7 +98,7 @@ class RemoteClient[Q, R](Policy):
         Raises:
             InputError: Not a valid address, one with a user name or password, or a token that no HTTP header can carry.
         """
-        self.address = read_address(url)
+        self.address = self._address(url)
         if not (math.isfinite(timeout) and 0.0 < timeout <= 86400.0):
             raise InputError(f"--remote-timeout {timeout:g}: expected seconds above 0 and up to a day")
         if retries < 0:
@@ -131,6 +138,9 @@ class RemoteClient[Q, R](Policy):
         return not self._seeded
 
     # What a protocol defines.
+
+    def _address(self, url: str) -> ServerAddress:
+        return read_address(url)
 
     def _connect(self) -> ServerLink[Q, R]:
         """A link that is not connected yet."""
@@ -190,7 +200,7 @@ class RemoteClient[Q, R](Policy):
                 reason = cause(error)
                 if attempt < self.retries:
                     time.sleep(self.backoff * 2**attempt)
-        raise InputError(f"--policy remote:{self.url}: no server answers there ({reason})")
+        raise InputError(f"--policy {self.name}:{self.url}: no server answers there ({reason})")
 
     def refusal(self, error: RemoteError) -> InputError:
         """Error of `check` for an address where the first request failed."""
@@ -199,7 +209,7 @@ class RemoteClient[Q, R](Policy):
             message += "; --remote-insecure does without the check"
         elif "status 401" in message or "status 403" in message:
             message += f"; a token is taken from the environment variable {TOKEN_VARIABLE}"
-        return InputError(f"--policy remote: no {self.described.removeprefix('a ')}: {message}")
+        return InputError(f"--policy {self.name}: no {self.described.removeprefix('a ')}: {message}")
 
     def take(self, facts: ServedFacts) -> None:
         """Compare what a server declares with what this robot takes, and follow it where either is possible.
@@ -207,7 +217,7 @@ class RemoteClient[Q, R](Policy):
         Raises:
             InputError: They differ; the message names both values.
         """
-        where = f"--policy remote:{self.url}"
+        where = f"--policy {self.name}:{self.url}"
         # `--labels v4` is a statement; v3.1 is also the default.
         asked = self.protocol.name if self.protocol is not LABELS["v3.1"] else None
         try:
@@ -277,7 +287,7 @@ class RemoteClient[Q, R](Policy):
         self._seeds.clear()
         self._steps.clear()
         if errors:
-            raise InputError(f"--policy remote: the server's answer to a robot that stands: {errors[0]}")
+            raise InputError(f"--policy {self.name}: the server's answer to a robot that stands: {errors[0]}")
 
     def reset(self, seeds: Sequence[int], tasks: Sequence[str], mask: Mask = None) -> None:
         """Send the seed of each beginning episode; a world whose reset fails gets that error at its next `act`.
@@ -460,15 +470,15 @@ class RemoteClient[Q, R](Policy):
             return
         last = list(failed.values())[-1]
         if any(error.silent for error in failed.values()) and not self._alive():
-            raise PolicyUnavailable(f"--policy remote: the server is gone: {last}")
+            raise PolicyUnavailable(f"--policy {self.name}: the {self.described.split()[2]} is gone: {last}")
         for error in failed.values():
             if error.lost:
-                raise PolicyUnavailable(f"--policy remote: {error}; the episodes that were running stay unplayed")
+                raise PolicyUnavailable(f"--policy {self.name}: {error}; the episodes that were running stay unplayed")
         if not usable:
             self._failures += len(failed) * weight
         if self._failures >= MAX_FAILURES:
             raise PolicyUnavailable(
-                f"--policy remote: {self._failures} requests in a row brought no usable answer, last: {last}"
+                f"--policy {self.name}: {self._failures} requests in a row brought no usable answer, last: {last}"
             )
 
     def _alive(self) -> bool:

@@ -200,10 +200,9 @@ class PolicyServer:
         self.readers = MessageReaders()
         self._thread = threading.Thread(target=self._work, name="policy", daemon=True)
         self._known = {}
-        for name in tasks.names():
-            spec = tasks.get(name)
-            known = _Task(name, spec.gym_id, spec.instruction)
-            self._known |= {name: known, spec.gym_id: known}
+        for spec in tasks.specs():
+            known = _Task(spec.name, spec.gym_id, spec.instruction)
+            self._known |= {spec.name: known, spec.gym_id: known}
 
     @property
     def facts(self) -> ServedFacts:

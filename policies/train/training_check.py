@@ -43,7 +43,7 @@ def check_training(options: PolicyTrainOptions) -> int:
         with torch.random.fork_rng([]):
             model = families.build(settings, made_statistics(), "cpu", weights)
         if model.reads_task:
-            model.tokens([tasks.get(name).instruction for name in tasks.names()])
+            model.tokens([tasks.get(name).instruction for name in tasks.PAPER])
     return _written(options, settings)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from arena_newton import trackers
+from arena_newton.interfaces import NEEDS
 from arena_newton.robot.g1 import TWIST2_DRIVE, PhysicsRate
 from arena_newton.testing import ConformanceError, check_tracker
 from arena_newton.trackers import Tracker
@@ -191,6 +192,28 @@ def test_a_memory_conforms():
         assert all(result.ok for result in check_tracker(Lagging(), worlds=worlds))
     with pytest.raises(ValueError, match="at least 2"):
         check_tracker(Lagging(), worlds=1)
+
+
+class Foreseeing(Lagging):
+    """Follows the mean of a window, moved by what state estimation says."""
+
+    needs, lookahead = NEEDS, 3
+
+    def step(self, command, state, mask=None):
+        lean = (command.position - state.position).mean(1) + state.lin_vel[:, 0] + 1e-3 * state.foot_force[:, 1]
+        wanted = command.ahead.joints[:, 0] + command.ahead.joints[:, 1] + command.ahead.joints[:, 2]
+        command = dataclasses.replace(command, joints=wanted + lean[:, None] + command.ahead.position[:, 0, :1])
+        return super().step(command, state, mask)
+
+
+def test_declared_fields_are_given():
+    """A tracker with a window and state estimation keeps every promise; one that declares nothing gets None."""
+    assert all(result.ok for result in check_tracker(Foreseeing()))
+    silent = type("Silent", (Foreseeing,), {"needs": ()})
+    results = {result.name: result for result in check_tracker(silent(), raises=False)}
+    assert results["attributes"].ok and "NoneType" in results["targets"].message
+    wrong = type("Wrong", (Foreseeing,), {"lookahead": -1})
+    assert "lookahead is -1" in {r.name: r for r in check_tracker(wrong(), raises=False)}["attributes"].message
 
 
 def test_a_tracker_without_memory_needs_no_mask():

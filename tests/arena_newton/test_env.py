@@ -1,5 +1,7 @@
 """The batch of worlds: resets, observations, steps, verdicts; what happens to one world changes no bit of another."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -130,6 +132,17 @@ def test_what_ran_is_described(env):
     assert said["tracker"]["name"] == "pd"
 
 
+def test_hands_can_be_chosen(env):
+    """Fixed hands have no joints and no actuators, and are named in results; the usual ones are not."""
+    fixed = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", hands="fixed")
+    fixed.reset([1])
+    assert fixed.step(np.tile(STAND_ACTION, (1, 1))).tolist() == [codes.RUNNING]
+    assert fixed.describe()["hands"] == "fixed" and "hands" not in env.describe()
+    assert env.physics.mj_model.nu - fixed.physics.mj_model.nu == 14
+    with pytest.raises(InputError, match=r"prim /World/Robot has no hands 'claws', known are dex3 fixed"):
+        ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", hands="claws")
+
+
 def test_a_drive_can_be_chosen():
     """A drive given by hand reaches the actuators; `released` takes the original's for a checkpoint that has one."""
     tracker = trackers.get("pd")
@@ -143,6 +156,20 @@ def test_a_drive_can_be_chosen():
         assert env.describe()["drive"] == env.drive.name == name
         gains = env.physics.mj_model.actuator_gainprm[env.scene.robot.joint_ctrl, 0]
         assert np.allclose(gains, env.drive.kp)
+        assert "armature" not in env.describe()["gains"]
+
+
+def test_a_drive_declares_the_rotor_inertia_that_its_gains_are_made_for():
+    """Declared rotor inertia is that of the body joints, and is described; fingers and root keep theirs."""
+    declared = tuple(0.01 + 0.001 * joint for joint in range(29))
+    tracker = trackers.get("pd")
+    plain = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco")
+    drive = dataclasses.replace(tracker.drive, armature=declared)
+    env = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco", drive=drive)
+    found, body = env.physics.mj_model.dof_armature, env.scene.robot.joint_qvel
+    assert np.allclose(found[body], declared) and env.describe()["gains"]["armature"] == declared
+    others = np.setdiff1d(np.arange(len(found)), body)
+    assert np.array_equal(found[others], plain.physics.mj_model.dof_armature[others])
 
 
 def test_a_fall_counts_in_the_startup_whatever_the_predicate_says(won):

@@ -1,14 +1,21 @@
 """Adding a task: one record, one scene, one judge; nothing that lists tasks forgets it."""
 
+import dataclasses
+import importlib
 import json
 import shutil
+from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
 from arena_newton import rule_sets, tasks
+from arena_newton.doctor import _scenes
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main as eval_main
+from arena_newton.eval.adapters import gym
+from arena_newton.eval.certification.context import with_expert
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.statistics import stats
@@ -16,6 +23,8 @@ from arena_newton.usd_scenes.__main__ import main as scenes_main
 from arena_newton.usd_scenes.skeleton import write
 from arena_newton.usd_scenes.validate import task_of, validate
 from scene_builders.__main__ import parts
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_registered_task_is_listed_and_judged_by_its_rules(bell, capsys):
@@ -32,7 +41,9 @@ def test_a_registered_task_is_listed_and_judged_by_its_rules(bell, capsys):
 
 
 def test_hashes_of_other_tasks_do_not_change(bell):
-    """A run of other tasks keeps its identity when a task is registered."""
+    """A run of other tasks keeps its identity, and the rules that it stores, when a task is registered."""
+    assert tuple(one.task for one in rule_sets.get("paper", ["football"]).tasks) == tasks.OWN
+    assert rule_sets.get("paper", [bell]).tasks[-1].task == bell
     with_bell = {name: rule_sets.get(name).hash_for(tasks.names()[:-1]) for name in rule_sets.names()}
     tasks.unregister(bell)
     assert with_bell == {name: rule_sets.get(name).hash for name in rule_sets.names()}
@@ -86,19 +97,148 @@ def test_names_that_are_taken_are_refused(bell):
         tasks.register(tasks.get(bell))
     with pytest.raises(InputError, match="'football': the name is taken"):
         tasks.register(tasks.get("football"))
-    with pytest.raises(InputError, match="--task gong: unknown, choose from .*, bell or all"):
+    with pytest.raises(InputError, match="--task gong: unknown task; known are bell, boxing"):
         tasks.get("gong")
 
 
-@pytest.mark.parametrize("name", tasks.PAPER)
-def test_every_task_of_the_paper_is_complete(name):
-    """A suite, requirements, predicates and, where there is one, an expert that can be imported."""
-    import importlib
+def test_all_are_the_papers(bell):
+    """`all`, the default run and an average of the paper do not take in a task that was added."""
+    for named in ((), ("all",)):
+        assert (
+            resolve(RunOptions(task=named, policy="stand", tracker=("pd",), engine="mujoco")).flags.task == tasks.PAPER
+        )
+    assert with_expert(()) == with_expert(("all",)) == (tasks.PAPER, ())
+    assert bell in tasks.names() and bell not in stats.suites()["ALL_AVG"]
 
-    spec = tasks.get(name)
-    assert spec.suite in ("HOI", "HSI") and spec.requires and spec.layer.is_file()
-    assert len(spec.predicates) > 1 and len({p.name for p in spec.predicates}) == len(spec.predicates)
-    assert all(np.isfinite(spec.spawn_position)) and abs(np.linalg.norm(spec.spawn_quat) - 1.0) < 1e-6
-    if spec.expert is not None:
-        module, _, attribute = spec.expert.partition(":")
-        assert callable(getattr(importlib.import_module(module), attribute))
+
+def test_a_record_without_what_others_have_is_refused(bell):
+    """A task of another package names its scene, and with an interaction the prim to find."""
+    spec = dataclasses.replace(tasks.get(bell), name="gong", interaction=tasks.get("boxing").interaction)
+    with pytest.raises(InputError, match="task 'gong': `target` must name the prim to find"):
+        tasks.register(spec)
+    with pytest.raises(InputError, match="task 'gong': `scene` must name the layer"):
+        tasks.register(dataclasses.replace(spec, scene=None))
+
+
+BROKEN = {
+    "gone": ("nowhere.at_all:TASK", "--task gone: its package does not load .ModuleNotFoundError: No module named"),
+    "number": ("math:pi", "--task number: its package offers a float, not a task"),
+    "renamed": ("arena_newton.tasks.boxing:TASK", "--task renamed: its package calls it boxing"),
+}
+"""Entry point → what it names, and what is said of it."""
+
+
+def test_a_package_that_does_not_load_disturbs_no_other_task(tmp_path, monkeypatch):
+    """A task that its package fails to give is refused by name; lists and rule sets have all others."""
+    rules = rule_sets.get("paper").hash
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    lines = [f"{name} = {target}\n" for name, (target, _) in BROKEN.items()]
+    info.joinpath("entry_points.txt").write_text("[arena_newton.tasks]\n" + "".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert tasks.names() == (*tasks.OWN, *BROKEN) and tuple(spec.name for spec in tasks.specs()) == tasks.OWN
+    assert rule_sets.get("paper").hash == rules
+    for name, (_, said) in BROKEN.items():
+        with pytest.raises(InputError, match=said):
+            tasks.get(name)
+    found = [finding.value for finding in _scenes() if finding.status == "bad"]
+    assert len(found) == len(BROKEN) and all(text.startswith("--task ") for text in found)
+
+
+def test_a_task_of_a_package_is_known_everywhere(push_bin, capsys):
+    """Installed, a task is listed, validated with its variants, has a Gym id and judges without a kernel of its own."""
+    assert tasks.names()[-1] == "push_bin" and tasks.get("push_bin").layer == push_bin / "scene.usda"
+    assert scenes_main(["list"]) == 0 and "push_bin     base, semantic " in capsys.readouterr().out
+    assert scenes_main(["validate", "push_bin", "--no-spawn"]) == 0
+    assert capsys.readouterr().out.count(": ok") == 2
+    assert eval_main(["list", "--task", "push_bin", "--mode", "base", "semantic", "--json"]) == 0
+    assert capsys.readouterr().out.count('"task": "push_bin"') == 120
+    gym.register()
+    assert "arena_newton/PushBin-v0" in gymnasium.registry
+    del gymnasium.registry["arena_newton/PushBin-v0"]
+    assert "push_bin" in rule_sets.markdown() and missing_rows(tasks.get("push_bin"), own=False) == []
+
+
+def test_the_scene_of_a_package_is_what_its_builder_writes(push_bin, tmp_path):
+    """Its layers are built again byte for byte in a folder far from this package, and name no path of a machine."""
+    importlib.import_module("push_bin.build").build(tmp_path)
+    for name in ("scene.usda", "variants/semantic.usda"):
+        assert (tmp_path / name).read_bytes() == (ROOT / "examples" / "new_task" / "push_bin" / name).read_bytes()
+        assert "@/" not in (tmp_path / name).read_text()
+
+
+def test_the_expert_of_a_package_solves_its_task_and_resume_knows_the_package(push_bin, tmp_path, capsys):
+    """Base and semantic mode are solved through twist2; a change of the scene or of the code is refused by name."""
+    out = tmp_path / "run"
+    flags = "--task push_bin --tracker twist2 --mode base semantic --seeds 900 --repeats 1 --engine mujoco".split()
+    assert eval_main(["run", *flags, "--failures", "--out", str(out)]) == 0
+    lines = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert [(line["mode"], line["outcome"]) for line in lines] == [("base", "success"), ("semantic", "success")]
+    assert all(line["signals"]["first_pixels"] > 10 and line["signals"]["first_touch"] for line in lines)
+    assert all(list(line["predicates"]) == ["approach", "contact", "transport", "rest"] for line in lines)
+    for file, old, new in (("scene.usda", "mass = 10", "mass = 12"), ("expert.py", "PALMS = ((0.36", "PALMS = ((0.35")):
+        text = (push_bin / file).read_text()
+        assert old in text
+        (push_bin / file).write_text(text.replace(old, new))
+        capsys.readouterr()
+        assert eval_main(["resume", str(out)]) == 2
+        key = "scene" if file == "scene.usda" else "code"
+        assert f"another configuration: foreign_tasks.push_bin.{key} was" in capsys.readouterr().err
+        (push_bin / file).write_text(text)
+    assert eval_main(["resume", str(out)]) == 0
+
+
+def missing_rows(spec, own=True):
+    """What a task lacks, each with the file to edit."""
+    name, rows = spec.name, {}
+    record = f"arena_newton/tasks/{name}.py"
+    rows[f"{record}: requires"] = spec.requires
+    rows[f"{record}: predicates, more than success, of different names"] = len(spec.predicates) > 1 and len(
+        {predicate.name for predicate in spec.predicates}
+    ) == len(spec.predicates)
+    rows[f"{record}: spawn_quat of length 1"] = abs(np.linalg.norm(spec.spawn_quat) - 1.0) < 1e-6
+    rows[f"{record}: target, one of `requires` or above one"] = spec.target and any(
+        f"{item.path}/".startswith(f"{spec.target}/") for item in spec.requires
+    )
+    rows[f"{record}: interaction"] = spec.interaction
+    rows[f"{record}: interaction.predicate, one of `predicates`"] = spec.interaction and (
+        spec.interaction.predicate in ("", *(predicate.name for predicate in spec.predicates[:-1]))
+    )
+    rows[f"{record}: semantic_change"] = spec.semantic_change
+    module, _, attribute = (spec.expert or "").partition(":")
+    rows[f"{record}: expert, a class whose `task` is its name"] = (
+        spec.expert and getattr(importlib.import_module(module), attribute).task == name
+    )
+    rows[f"scene_builders/{name}.py: the scene is built"] = spec.layer.is_file()
+    if own:
+        rows |= {
+            "arena_newton/tasks/__init__.py: OWN": name in tasks.OWN,
+            f"scene_builders/{name}.py: build": (ROOT / "scene_builders" / f"{name}.py").is_file(),
+            "docs/policies.md: table of instructions": f"| {spec.instruction} |" in page_of("policies"),
+            "docs/rules.md: python -m arena_newton.rule_sets": f"| {name} | {spec.predicates[0].name} |"
+            in page_of("rules"),
+            "docs/experts.md": name in page_of("experts"),
+        }
+    return [row for row, there in rows.items() if not there]
+
+
+def page_of(name):
+    """Text of a page of the documentation."""
+    return (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def test_every_task_of_the_tree_has_each_row(bell):
+    """No task lacks what failures, visibility, pages and experts read of it; one that lacks all is told all files."""
+    lacking = {name: missing_rows(tasks.get(name)) for name in tasks.OWN}
+    assert {name: rows for name, rows in lacking.items() if rows} == {}
+    assert {spec.suite for spec in map(tasks.get, tasks.PAPER)} == {"HOI", "HSI"}
+    files = {row.partition(":")[0] for row in missing_rows(tasks.get(bell))}
+    assert files == {
+        "arena_newton/tasks/__init__.py",
+        "arena_newton/tasks/bell.py",
+        "docs/experts.md",
+        "docs/policies.md",
+        "docs/rules.md",
+        "scene_builders/bell.py",
+    }

@@ -1,6 +1,7 @@
 """Episodes: results do not depend on the batch, errors stay in their world, hooks see what they are promised."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,13 @@ import warp as wp
 from arena_newton import tasks, trackers
 from arena_newton.env import STAND_ACTION, ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.interfaces import Chunk, EpisodeEvent, Predicate, Recorder
+from arena_newton.interfaces import NEEDS, Chunk, EpisodeEvent, Predicate, Recorder
 from arena_newton.policies.base import Policy
 from arena_newton.policies.lerobot.chunk_memory import ChunkMemory
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.football import FootballJudge
+from arena_newton.tracking import TrackerLoop
 
 STEPS = 30
 
@@ -407,6 +409,75 @@ def test_a_policy_reads_the_world_and_writes_nothing(env):
     first = Rollout(env, Sway(), _episodes(2), max_steps=12).run()
     second = Rollout(env, Meddling(), _episodes(2), max_steps=12).run()
     assert [(r.steps, r.margin) for r in first] == [(r.steps, r.margin) for r in second] and all(seen)
+
+
+class Seeing(trackers.base.Tracker):
+    """The PD tracker with all that a tracker may declare; keeps what it is given."""
+
+    name, drive = "seeing", trackers.get("pd").drive
+    needs, lookahead = NEEDS, 4
+
+    def bind(self, worlds, device="cpu"):
+        super().bind(worlds, device)
+        self.seen = []
+
+    def step(self, command, state, mask=None):
+        self.seen.append([{name: tensor.clone() for name, tensor in one.tensors().items()} for one in (command, state)])
+        return command.joints
+
+
+@pytest.fixture(scope="module")
+def seeing(env):
+    """An environment after 20 ticks of chunks of six actions under `Seeing`, which changes nothing of PD's results."""
+    own = ArenaEnv("football", tracker=Seeing(), worlds=2, engine="mujoco", device="cpu", fast_physics=True)
+    expected, results = (Rollout(one, Dated(), _episodes(2), max_steps=20).run() for one in (env, own))
+    assert [(r.steps, r.margin) for r in results] == [(r.steps, r.margin) for r in expected]
+    return own
+
+
+def test_a_window_holds_the_references_that_come(seeing):
+    """Bit for bit those of the next ticks; from a chunk's end on its last is repeated, and during the start-up."""
+    commands = [command for command, _ in seeing.tracker.seen]
+    names = [name.removeprefix("ahead.") for name in commands[0] if name.startswith("ahead.")]
+    assert names == ["mimic", "joints", "joint_vel", "quat", "position"]
+    start = seeing.startup_ticks
+    for tick in range(start + 18):
+        last = tick if tick < start else start + (tick - start) // 6 * 6 + 5
+        for k, name in itertools.product(range(4), names):
+            coming = commands[min(tick + 1 + k, last)][name]
+            assert torch.equal(commands[tick][f"ahead.{name}"][:, k], coming), (tick, k, name)
+
+
+def test_an_action_that_cannot_be_executed_ends_the_window(seeing):
+    """From the first such action of a row on the reference before it is repeated, whatever follows."""
+    env, coming = seeing, torch.from_numpy(STAND_ACTION).repeat(2, 4, 1)
+    coming[:, :, 0] = 0.01
+    coming[1, 2, 5] = torch.nan
+    env.reset([1, 2])
+    env.loop.announce(coming)
+    env.loop.tick(coming[:, 0].contiguous(), np.ones(2, dtype=bool))
+    travelled = (env.loop.command.ahead.position - env.loop.command.position[:, None]).norm(dim=2)
+    assert torch.allclose(travelled / 0.01, torch.tensor([[1.0, 2, 3, 4], [1, 2, 2, 2]]), atol=1e-3)
+
+
+def test_needs_are_measured(seeing):
+    """Position and velocity are the root's; the feet of a robot that stands carry its weight, half each or so."""
+    commands, states = zip(*seeing.tracker.seen, strict=True)
+    model, root = seeing.scene.mj_model, seeing.scene.robot.root_body
+    travelled = 0.02 * torch.stack([state["lin_vel"] for state in states[1:41]]).sum(0)
+    assert torch.allclose(states[40]["position"] - states[0]["position"], travelled, atol=3e-3)
+    weight = 9.81 * model.body_subtreemass[root]
+    carried = torch.stack([state["foot_force"] for state in states[30:50]]).mean(0) / weight
+    assert torch.allclose(carried.sum(1), torch.ones(2), atol=0.1) and (carried > 0.3).all()
+    assert torch.allclose(commands[49]["position"][:, :2], states[0]["position"][:, :2], atol=1e-6)
+
+
+def test_an_unknown_need_is_refused(env):
+    """A field that no state has is one error with the names of those that there are."""
+    tracker = trackers.get("pd")
+    tracker.needs = ("altitude",)
+    with pytest.raises(InputError, match="tracker pd: needs 'altitude'; known are position, lin_vel, foot_force"):
+        TrackerLoop(env.physics, env.scene.robot, tracker)
 
 
 class Executed(Recorder):

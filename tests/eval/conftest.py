@@ -120,3 +120,17 @@ def boxed(watched_worlds):
 
     table = Table()
     return table, *watched_rollout(watched_worlds, "boxing", 2, 2, policies.get("expert"), recorder=table)
+
+
+@pytest.fixture
+def push_bin():
+    """Name of a registered task with an interaction, for which no saboteur and no seed was set."""
+    import dataclasses
+
+    from arena_newton import tasks
+
+    like = tasks.get("vis_navi")
+    carried = dataclasses.replace(like.interaction, carried=True)
+    tasks.register(dataclasses.replace(like, name="push_bin", scene=like.layer, interaction=carried))
+    yield "push_bin"
+    tasks.unregister("push_bin")

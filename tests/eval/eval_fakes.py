@@ -16,7 +16,7 @@ import torch
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.play.run import Factories
-from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Verdict
+from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Recorder, Verdict
 from arena_newton.kernels import tick as codes
 from arena_newton.policies.base import Policy
 
@@ -146,6 +146,8 @@ class FakePolicy:
         self.seeds = [new if mask is None or mask[world] else old[world] for world, new in enumerate(seeds)]
 
     def act(self, observation):
+        if self.name in os.environ.get("FAKE_HANGS", "").split():
+            time.sleep(600)
         return Chunk(torch.zeros(len(observation.mask), self.chunk_size, 40))
 
     def describe(self):
@@ -153,6 +155,19 @@ class FakePolicy:
 
     def close(self):
         """Nothing to release."""
+
+
+class LastTick(Recorder):
+    """Gives each episode that does not fall its last tick as a metric."""
+
+    def finish(self, env, world, result):
+        if result.outcome != "fall":
+            result.extra["last_tick"] = float(env.tick[world])
+
+
+def last_tick(env):
+    """Recorders of an environment."""
+    return [LastTick()]
 
 
 def fake_tracker(spec, checkpoint):

@@ -1,5 +1,8 @@
 """Signals for tests: those of an episode that went well, with some changed."""
 
+import dataclasses
+
+from arena_newton import tasks
 from arena_newton.eval.records.episode_signals import EpisodeSignals
 
 WELL = {
@@ -37,3 +40,8 @@ UNTOUCHED = {"touches": 0, "first_touch": None, "touch_distance": None, "touch_b
 def signals(**changes):
     """The signals of `WELL` with changes."""
     return EpisodeSignals(**(WELL | changes))
+
+
+def without_signals(monkeypatch, task):
+    """Take the interaction out of a task's record."""
+    monkeypatch.setattr(f"arena_newton.tasks.{task}.TASK", dataclasses.replace(tasks.get(task), interaction=None))

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -89,11 +88,3 @@ def kill_all(machine):
         except psutil.Error:
             continue
     machine.wait()
-
-
-def wait_for(condition, seconds=120.0):
-    """Wait until something holds."""
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "it does not happen"
-        time.sleep(0.1)

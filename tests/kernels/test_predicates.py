@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from arena_newton.kernels.rules import predicates
-from arena_newton.kernels.rules.predicates import ANGLE, AWAY, CLEAR, MARGIN, NEAR, TOWARD, UNLATCHED
+from arena_newton.kernels.rules.predicates import ANGLE, AWAY, CLEAR, MARGIN, NEAR, SLOW, TOWARD, UNLATCHED, UPRIGHT
 
 
 def distance(point, marker, xpos, xquat, twin, horizontal):
@@ -66,7 +66,7 @@ def test_near_and_clear_measure_the_distance_of_points_to_a_turned_box(twin, dev
         assert 0.02 < expected.mean() < 0.98
 
 
-def test_motion_facing_hinge_latch_and_margin(twin, device):
+def test_motion_facing_hinge_latch_margin_speed_and_tilt(twin, device):
     """Each further kind agrees with its formula, both ways."""
     rng = np.random.default_rng(2)
     worlds = 400
@@ -85,8 +85,11 @@ def test_motion_facing_hinge_latch_and_margin(twin, device):
         (ANGLE, 0, 4, 0, 0, 0, 0),
         (UNLATCHED, 0, 0, 0, 0, 0, 0),
         (MARGIN, 0, 0, 0, 0, 0, 0),
+        (SLOW, 0, 6, 0, 0, 0, 0),
+        (SLOW, 1, 6, 0, 0, 0, 0),
+        (UPRIGHT, 0, 0, 0, 1, 0, 0),
     ]
-    out = launch(stage, terms, (0.3, 0.5, 1.0, 0.0, 0.0), [(1, (0.0, 0.0, 0.0))], [box], **state)
+    out = launch(stage, terms, (0.3, 0.5, 1.0, 0.0, 0.0, 1.5, 1.0, 0.3), [(1, (0.0, 0.0, 0.0))], [box], **state)
     goal = np.array(box.pos[:2]) - stage.xpos[:, 1, :2]
     goal /= np.linalg.norm(goal, axis=1, keepdims=True)
     ahead = twin.matrix(stage.xquat[:, 1])[:, :2, 0]
@@ -97,6 +100,9 @@ def test_motion_facing_hinge_latch_and_margin(twin, device):
         np.abs(stage.qpos[:, 4]) >= 1.0,
         state["latched"] == 0,
         state["margin"] >= 0.0,
+        np.linalg.norm(state["qvel"][:, 6:9], axis=1) <= 1.5,
+        np.linalg.norm(state["qvel"][:, 6:8], axis=1) <= 1.0,
+        twin.matrix(stage.xquat[:, 1])[:, 2, 2] >= 0.3,
         state["success"] == 1,
     )
     for column, answer in enumerate(expected):
@@ -125,3 +131,36 @@ def test_a_predicate_is_the_conjunction_of_its_conditions(twin, device):
     )
     near = distance(stage.xpos[:, 1].astype(float), box, stage.xpos, stage.xquat, twin, False) <= 0.1
     assert np.array_equal(out.numpy()[:, 0] == 1, near & (latched == 0)) and near.any() and not near.all()
+
+
+def test_success_of_conditions_is_their_smallest_slack_for_some_ticks(twin, device):
+    """The margin is the least of all slacks; success needs it at least 0 for so many ticks in a row, counted anew."""
+    rng = np.random.default_rng(3)
+    stage = twin.Stage(device)
+    box = twin.Marker(0, (0, 0, 0), (1, 0, 0, 0), (0.4, 0.4, 0.4))
+    speeds = rng.uniform(0.0, 0.4, (3, stage.worlds)).astype(np.float32)
+    counter, success = (wp.zeros(stage.worlds, dtype=wp.int32, device=device) for _ in range(2))
+    margin = wp.zeros(stage.worlds, dtype=wp.float32, device=device)
+    gap = distance(stage.xpos[:, 1].astype(float), box, stage.xpos, stage.xquat, twin, False)
+    run = np.zeros(stage.worlds, int)
+    for speed in speeds:
+        qvel = np.zeros((stage.worlds, 20), np.float32)
+        qvel[:, 7] = speed
+        predicates.launch_conditions(
+            *(stage.up(a) for a in (stage.xpos, stage.xquat, stage.qpos, qvel)),
+            stage.up(np.zeros(stage.worlds), wp.int32),
+            ticks=2,
+            terms=stage.up([(NEAR, 0, 0, 0, 1, 0, 1), (SLOW, 0, 6, 1, 1, 1, 1), (CLEAR, 0, 0, 0, 1, 0, 1)], wp.int32),
+            limits=stage.up([0.3, 0.3, -0.3]),
+            point_body=stage.up([1], wp.int32),
+            point_pos=wp.array([wp.vec3(0.0, 0.0, 0.0)], dtype=wp.vec3, device=device),
+            boxes=stage.boxes(box),
+            counter=counter,
+            success=success,
+            margin=margin,
+        )
+        slack = np.minimum(np.minimum(0.3 - gap, 0.3 - speed), gap + 0.3)
+        assert margin.numpy() == pytest.approx(slack, abs=1e-5)
+        run = np.where(margin.numpy() >= 0.0, run + 1, 0)
+        assert np.array_equal(success.numpy() == 1, run >= 2)
+    assert 0 < success.numpy().sum() < stage.worlds

@@ -105,7 +105,7 @@ def test_request_tables():
             self.answer(200, {"action": STAND_ACTION.tolist()})
 
     server = JsonServer(Listen)
-    policy = RemotePolicy(server.url, timeout=5.0)
+    policy = RemotePolicy(server.url, timeout=120.0)
     policy.reset([3], ["Isaac-Boxing"])
     assert policy.act(observation(1)).errors == {}
     policy.close()

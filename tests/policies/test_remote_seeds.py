@@ -89,7 +89,7 @@ def play(policy, seeds, worlds):
 def run(server, worlds, seeds=SEEDS, loop=play, **options):
     """Endings of the episodes by seed, and all that the server saw, by seed and step, to the last bit."""
     server.seen = {}
-    policy = RemotePolicy(server.url, timeout=20.0, retries=3, backoff=0.01, **options)
+    policy = RemotePolicy(server.url, timeout=120.0, retries=3, backoff=0.01, **options)
     policy.needs_image = False
     policy.check()
     ends = loop(policy, seeds, worlds)

@@ -19,4 +19,4 @@ def inputs(seed: int, worlds: int, device: str = "cpu") -> tuple[TrackerCommand,
 
 def rows(value, index):
     """The same of some worlds."""
-    return type(value)(**{name: tensor[index] for name, tensor in vars(value).items()})
+    return value.mapped(lambda tensor: tensor[index])

@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import sys
 import types
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 import tyro
 from torch import nn
 
+from arena_newton.cli import registry
 from arena_newton.errors import InputError
 from arena_newton.robot.g1 import PhysicsRate
 from arena_newton.trackers import interface, sonic, twist2
@@ -23,6 +25,7 @@ from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, 
 from arena_newton.trackers.train import train_options
 from arena_newton.trackers.train.train_options import TrainOptions, check
 
+NAMED = {"theirs": "make", "wrong": "wrong"}
 RATE = PhysicsRate(dt=0.005, substeps=4)
 
 
@@ -78,6 +81,20 @@ def test_training_finds_it(small):
     assert isinstance(front, SmallFrontEnd) and (found.drive, found.rate) == (small.drive, RATE)
     assert "small" in interface.names() and front.obs_width == small.obs_width
     check(TrainOptions(tracker="small"))
+
+
+def test_another_package_offers_one(monkeypatch):
+    """An entry point of `arena_newton.interfaces` is listed and made; what makes no record is one line."""
+    module = types.ModuleType("their_interfaces")
+    module.make = lambda: dataclasses.replace(twist2.INTERFACE, name="theirs")
+    module.wrong = lambda: "record"
+    monkeypatch.setitem(sys.modules, "their_interfaces", module)
+    points = [EntryPoint(n, f"their_interfaces:{f}", "arena_newton.interfaces") for n, f in NAMED.items()]
+    monkeypatch.setattr(registry, "_installed", lambda group, path: points)
+    assert interface.names() == ("sonic", "theirs", "twist2", "wrong")
+    assert interface.get("theirs").name == "theirs" and interface.get("twist2") is twist2.INTERFACE
+    with pytest.raises(InputError, match="--tracker wrong: its factory makes a str, not a Interface"):
+        interface.get("wrong")
 
 
 def test_the_command_line_offers_it(small, monkeypatch, capsys):

@@ -101,6 +101,19 @@ def test_registration():
         tracker.step(None, None)
 
 
+def test_argument():
+    """What follows a colon reaches the tracker's factory; one that takes none refuses it in one line."""
+
+    class Mine(trackers.Tracker):
+        def __init__(self, variant):
+            self.name = f"mine {variant}"
+
+    trackers.register("varied", lambda checkpoint, variant="a": Mine(variant))
+    assert [trackers.get(spec).name for spec in ("varied", "varied:b:c")] == ["mine a", "mine b:c"]
+    assert "--tracker pd: its factory does not take what it is given" in message("pd:stiff")
+    assert "--tracker nobody: unknown" in message("nobody:b")
+
+
 def test_entry_point(monkeypatch):
     """A tracker offered by another package's entry point is listed and loaded; a broken one is one line."""
     points = [

@@ -8,6 +8,9 @@ from made_inputs import inputs
 from arena_newton import trackers
 from arena_newton.errors import InputError
 from arena_newton.robot.g1 import CANONICAL_JOINTS, MUJOCO_JOINTS, SONIC_DRIVE
+from arena_newton.robot.rotations import heading, heading_quat
+from arena_newton.testing import check_tracker
+from arena_newton.trackers import TrackerCommand
 from arena_newton.trackers.sonic import SONIC_DEFAULT_POSE, SONIC_FORM, SonicFrontEnd, SonicTracker, official_pair
 
 ORDER = [MUJOCO_JOINTS.index(name) for name in CANONICAL_JOINTS]
@@ -169,9 +172,9 @@ def onnx_file(path, layers: list[int], *, batch: int | str = "batch", levels: in
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), str(path))
 
 
-def official_like(folder, **encoder):
+def official_like(folder, width=1762, **encoder):
     folder.mkdir(exist_ok=True)
-    onnx_file(folder / "model_encoder.onnx", [1762, 48, 64], **encoder)
+    onnx_file(folder / "model_encoder.onnx", [width, 48, 64], **encoder)
     onnx_file(folder / "model_decoder.onnx", [994, 48, 29], batch=encoder.get("batch", "batch"))
     return folder
 
@@ -218,3 +221,76 @@ def test_ways_to_name_the_pair(tmp_path):
     pair[1].write_bytes(b"noise")
     with pytest.raises(InputError, match="not a usable ONNX file"):
         trackers.get("sonic", folder)
+
+
+def heading_only(quat: np.ndarray) -> np.ndarray:
+    turn = matrix(quat)
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    return np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+
+
+PARTS = {
+    "default": (1762, 5, {"ref_pos": 4, "ref_vel": 294, "anchors": 601}),
+    "low_latency": (1247, 1, {"ref_pos": 4, "ref_vel": 294, "anchors": 584}),
+    "v1_1": (1751, 5, {"ref_pos": 4, "ref_vel": 294, "anchors": 584}),
+}
+"""Release → width of the encoder's input, ticks between frames, first columns of what mode `g1` fills."""
+
+
+@pytest.mark.parametrize("variant", PARTS)
+def test_releases(tmp_path, variant):
+    """Ten frames of the coming reference at the release's step, in canonical order; other modes' inputs are zero."""
+    width, step, first = PARTS[variant]
+    tracker = trackers.get(f"sonic:{variant}", official_like(tmp_path / "sonic", width))
+    assert tracker.lookahead == 9 * step and tracker.describe()["variant"] == variant
+    tracker.bind(3)
+    command, state = inputs(0, 3)
+    coming = [inputs(1 + tick, 3)[0] for tick in range(9 * step)]
+    parts = zip(*(one.tensors().values() for one in coming), strict=True)
+    command.ahead = TrackerCommand(*(torch.stack(part, 1) for part in parts))
+    tracker.step(command, state)
+    seen = tracker.observation().clone()
+    assert seen.shape == (3, width + 930)
+    for world in range(3):
+        frames = [command, *coming[step - 1 :: step]]
+        robot = state.quat[world].numpy().astype(float)
+        turn = heading_only(robot) if variant == "v1_1" else matrix(robot)
+        anchors = [(turn.T @ matrix(f.quat[world].numpy().astype(float)))[:, :2].reshape(-1) for f in frames]
+        expected = np.zeros(width)
+        expected[first["ref_pos"] :][:290] = np.concatenate([f.joints[world].numpy()[ORDER] for f in frames])
+        expected[first["ref_vel"] :][:290] = np.concatenate([f.joint_vel[world].numpy()[ORDER] for f in frames])
+        expected[first["anchors"] :][:60] = np.concatenate(anchors)
+        np.testing.assert_allclose(seen[world, :width].numpy(), expected, atol=2e-5)
+
+
+def test_a_release_conforms(tmp_path):
+    """The release with window and heading keeps every promise, the bits of a world alone and among others included."""
+    tracker = trackers.get("sonic:v1_1", official_like(tmp_path / "sonic", 1751))
+    assert all(result.ok for result in check_tracker(tracker))
+
+
+@pytest.mark.parametrize(
+    "spec, checkpoint, said",
+    [
+        ("sonic:v2", "sonic", "--tracker sonic:v2: unknown; known are default, low_latency, v1_1"),
+        ("sonic:v1_1", None, "--tracker sonic:v1_1: pass --checkpoint with the folder of its official networks"),
+        ("sonic:low_latency", "sonic", "the network takes 1762 numbers, expected 1247"),
+    ],
+)
+def test_unfit_releases(tmp_path, spec, checkpoint, said):
+    """An unknown release, one without networks and networks of another release are one line each."""
+    official_like(tmp_path / "sonic")
+    with pytest.raises(InputError, match=said):
+        trackers.get(spec, checkpoint and tmp_path / checkpoint)
+
+
+def test_heading_quat():
+    """The turn about the vertical of any orientation, also backwards and without one; a unit quaternion."""
+    quat = torch.nn.functional.normalize(torch.randn(200, 4, generator=torch.Generator().manual_seed(0)), dim=1)
+    special = torch.tensor([[1.0, 0, 0, 0], [0, 0, 0, 1], [0.70710678, 0, 0.70710678, 0], [1e-4, 0, 0, -1]])
+    quat = torch.cat([quat, special])
+    found = heading_quat(quat)
+    torch.testing.assert_close(found.norm(dim=1), torch.ones(len(quat)), atol=1e-6, rtol=0)
+    level = heading(quat)
+    off = torch.remainder(heading(found) - level + torch.pi, 2 * torch.pi) - torch.pi
+    assert (off[torch.arange(len(quat)) != 202].abs() < 1e-5).all() and (found[:, 1:3] == 0).all()

@@ -1,11 +1,14 @@
 """The football, two-desk and box scenes: what the layers say and how their things behave in MuJoCo."""
 
+import re
+
 import numpy as np
 import pytest
+from pxr import Gf
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
-from scene_builders import author, patterns, rooms, textures
+from scene_builders import author, patterns, rooms, textures, warehouse
 from scene_builders.__main__ import build_all
 from tests.scenes import scene
 
@@ -207,11 +210,34 @@ def test_stocked_decks_leave_the_second_one_empty():
 
 def test_layers_are_what_their_authors_write(tmp_path):
     """Building again gives the stored scenes, variants and textures, byte for byte."""
-    build_all(tmp_path, ["textures", "patterns", *tasks.names()])
+    build_all(tmp_path, ["textures", "patterns", "g1", *tasks.names()])
     files = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file())
     assert len(files) >= len(textures.TEXTURES) + 2 * len(tasks.names())
     for file in files:
         assert (tmp_path / file).read_bytes() == (tasks.base.SCENES / file).read_bytes(), file
+
+
+def test_a_scene_built_elsewhere_finds_the_parts_of_this_package(tmp_path):
+    """Robot and textures are named by the search path where they are not beside the layer; the layer composes."""
+    stage = rooms.task_stage(tmp_path, tasks.get("boxing"), eye=(0, 0, 2), gaze=author.look_at((0, 0, 2), (3, 0, 2)))
+    warehouse.room_looks(stage)
+    stage.GetRootLayer().Save()
+    text = (tmp_path / "scene.usda").read_text()
+    assert set(re.findall("@(.*?)@", text)) == {
+        "arena_newton/usd_scenes/g1/g1.usda",
+        "arena_newton/usd_scenes/textures/concrete.png",
+    }
+    assert stage.GetPrimAtPath("/World/Robot/pelvis")
+
+
+def test_a_camera_looks_at_a_point():
+    """A camera's -z points from the eye to the point, its y-axis as far upwards as that allows."""
+    for point in ((4.0, 1.0, 0.5), (-1.0, -3.0, 2.0), (0.0, 0.0, 0.0)):
+        turn = Gf.Rotation(Gf.Quatd(*author.look_at((0.0, 0.0, 2.0), point)))
+        ahead = np.array(point) - (0.0, 0.0, 2.0)
+        assert np.array(turn.TransformDir(Gf.Vec3d(0, 0, -1))) == pytest.approx(ahead / np.linalg.norm(ahead))
+        assert turn.TransformDir(Gf.Vec3d(1, 0, 0))[2] == pytest.approx(0.0, abs=1e-9)
+        assert turn.TransformDir(Gf.Vec3d(0, 1, 0))[2] >= -1e-9
 
 
 def test_a_forgotten_or_misspelled_look_is_refused(tmp_path):

@@ -31,8 +31,11 @@ def _median(tracker: Tracker, worlds: int, device: torch.device) -> float:
     zero = torch.zeros(worlds, 29, device=device)
     mimic = torch.zeros(worlds, 35, device=device)
     mimic[:, 2], mimic[:, 6:] = 0.78, joints
-    command = TrackerCommand(mimic=mimic, joints=joints, joint_vel=zero, quat=quat)
-    state = RobotState(quat=quat, ang_vel_body=zero[:, :3], joint_pos=joints, joint_vel=zero)
+    given = {name: zero[:, :2] if name == "foot_force" else zero[:, :3] for name in tracker.needs}
+    command = TrackerCommand(mimic=mimic, joints=joints, joint_vel=zero, quat=quat, position=given.get("position"))
+    if tracker.lookahead:
+        command.ahead = command.mapped(lambda t: t[:, None].expand(-1, tracker.lookahead, -1))
+    state = RobotState(quat=quat, ang_vel_body=zero[:, :3], joint_pos=joints, joint_vel=zero, **given)
     tracker.bind(worlds, device)
     tracker.prefill(command, state)
     wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None

@@ -21,7 +21,7 @@ from arena_newton.errors import InputError
 from arena_newton.files import limits
 from arena_newton.files.untrusted_files import read_bytes
 
-__all__ = ["OnnxNetwork", "load", "read"]
+__all__ = ["OnnxNetwork", "load", "metadata", "read"]
 
 _PROBE_ROWS = 7
 """Rows of the probe batch; a prime, so that a reshaped first dimension shows how it depends on the batch."""
@@ -416,6 +416,19 @@ def read(path: str | Path, *, in_width: int, flag: str = "--checkpoint") -> tupl
         raise
     except Exception as error:  # a damaged file fails anywhere inside protobuf
         raise InputError(f"{where}: {_reason(error)}") from error
+
+
+def metadata(path: str | Path, *, flag: str = "--checkpoint") -> dict[str, str]:
+    """Texts that the exporter of an ONNX file added to it, by their keys.
+
+    Raises:
+        InputError: The file is absent or not an ONNX network.
+    """
+    data = read_bytes(path, limits.NETWORK_BYTES, where=f"{flag} {path}")
+    try:
+        return {entry.key: entry.value for entry in onnx.load_model_from_string(data).metadata_props}
+    except Exception as error:  # a damaged file fails anywhere inside protobuf
+        raise InputError(f"{flag} {path}: {_reason(error)}") from error
 
 
 def _keep_first(graph: onnx.GraphProto, inputs: list[onnx.ValueInfoProto]) -> None:

@@ -60,13 +60,13 @@ class Weights:
 
     def metadata(self) -> dict[str, Any]:
         """The JSON object of the file's header."""
-        form, drive, physics = (dataclasses.asdict(x) for x in (self.action_form, self.drive, self.physics))
+        form, physics = (dataclasses.asdict(x) for x in (self.action_form, self.physics))
         return {
             "format": FORMAT,
             "interface": self.interface,
             "hidden": self.network.config(),
             "action_form": form,
-            "drive": drive,
+            "drive": self.drive.as_json(),
             "physics": physics,
             "symmetric": self.symmetric,
             "commit": self.card.get("commit"),
@@ -195,7 +195,8 @@ def action_form(value: Mapping[str, Any]) -> ActionForm:
 
 def drive(value: Mapping[str, Any]) -> DriveGains:
     """A drive from JSON; errors as `action_form`."""
-    vectors = {name: tuple(float(v) for v in value[name]) for name in ("kp", "kd", "effort")}
+    named = [name for name in ("kp", "kd", "effort", "armature") if name != "armature" or name in value]
+    vectors = {name: tuple(float(v) for v in value[name]) for name in named}
     fingers = {f"finger_{name}": float(value[f"finger_{name}"]) for name in ("kp", "kd", "effort", "armature")}
     for name, numbers in vectors.items():
         if len(numbers) != JOINTS or not all(math.isfinite(v) and v >= 0.0 for v in numbers):
@@ -203,7 +204,7 @@ def drive(value: Mapping[str, Any]) -> DriveGains:
     for name, number in fingers.items():
         if not (math.isfinite(number) and number >= 0.0):
             raise ValueError(f"drive {name} is {number}, expected a finite number of at least 0")
-    return DriveGains(str(value["name"]), vectors["kp"], vectors["kd"], vectors["effort"], **fingers)
+    return DriveGains(**{"name": str(value["name"]), **vectors, **fingers})
 
 
 def physics(value: Mapping[str, Any]) -> PhysicsRate:

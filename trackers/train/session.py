@@ -116,7 +116,7 @@ def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, proces
         data={"clips": library.clips, "families": families, "mirrored": options.mirror, "sources": sources[:64]},
         licences={str(n): int(c) for n, c in zip(*np.unique(library.licence, return_counts=True), strict=True)},
         action_form=dataclasses.asdict(env.front_end.action_form),
-        drive=dataclasses.asdict(env.interface.drive),
+        drive=env.interface.drive.as_json(),
         physics=dataclasses.asdict(env.interface.rate),
         rewards={name: term.weight for name, term in env.rewards.items()},
     )

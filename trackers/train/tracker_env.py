@@ -17,6 +17,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
 from arena_newton.robot import rotations
@@ -62,7 +63,11 @@ class TrackerEnv(VecEnv):
         critic_terms: Mapping[str, critic.CriticTerm] = critic.CRITIC,
         family_weights: Mapping[str, float] | None = None,
     ):
-        """Build the worlds on a device, `cpu` or `cuda:N`; families without a weight have 1."""
+        """Build the worlds on a device, `cpu` or `cuda:N`; families without a weight have 1.
+
+        Raises:
+            InputError: The interface needs a measurement that training does not make.
+        """
         self.cfg = options
         self.num_envs = worlds = options.worlds
         self.device = device
@@ -70,6 +75,9 @@ class TrackerEnv(VecEnv):
         self.interface = interface
         self.front_end: FrontEnd = interface.front_end(form)
         front_end = self.front_end
+        if "foot_force" in front_end.needs:
+            raise InputError(f"interface {interface.name!r}: needs foot_force, which training does not measure")
+        self._lookahead = torch.arange(1, front_end.lookahead + 1, device=device)
         self.num_actions = front_end.action_width
         self.rewards, self.terminations = dict(rewards), dict(terminations)
         self.events = dict(randomisation) if options.randomise else {}
@@ -303,11 +311,17 @@ class TrackerEnv(VecEnv):
         """
         now = self.bank.gather(self.frame)
         self._next_rows.copy_(self.bank.rows(torch.minimum(self.frame + 1, self.bank.last.index_select(0, self.frame))))
-        ahead = self.ahead
-        command = TrackerCommand(
-            mimic=ahead.mimic, joints=ahead.joint_pos, joint_vel=ahead.joint_vel, quat=ahead.root_quat
-        )
+        command = self._command(self.ahead)
+        if ticks := self.front_end.lookahead:
+            later = self.frame[:, None] + 1 + self._lookahead
+            frames = torch.minimum(later, self.bank.last.index_select(0, self.frame)[:, None])
+            window = self._command(self.bank.gather(frames.flatten()))
+            command.ahead = window.mapped(lambda t: t.unflatten(0, (-1, ticks)))
         state = self._noisy_state()
+        if "position" in self.front_end.needs:
+            state.position = self.sim.root_pos
+        if "lin_vel" in self.front_end.needs:
+            state.lin_vel = self.sim.root_vel
         self.front_end.reset(first)
         if self.cfg.randomise:
             first = first & (torch.rand(self.num_envs, device=self.device) < _PREFILL)
@@ -321,6 +335,10 @@ class TrackerEnv(VecEnv):
             self._critic_obs = observation
         else:
             self._critic_obs.copy_(observation)
+
+    def _command(self, frame: Frame) -> TrackerCommand:
+        position = frame.root_pos if "position" in self.front_end.needs else None
+        return TrackerCommand(frame.mimic, frame.joint_pos, frame.joint_vel, frame.root_quat, position)
 
     def _noisy_state(self) -> RobotState:
         sim = self.sim

@@ -260,7 +260,7 @@ def _check_origin(subject: _Subject) -> None:
 def _check_tasks(subject: _Subject) -> None:
     """Every episode has one instruction: that of its task."""
     files = subject.files
-    known = {tasks.get(name).instruction: name for name in tasks.names()}
+    known = {spec.instruction: spec.name for spec in tasks.specs()}
     for row in files.episode_rows:
         if len(row.tasks) != 1:
             raise DatasetMismatch(_meta(files), f"has {len(row.tasks)} instructions, expected 1", episode=row.index)

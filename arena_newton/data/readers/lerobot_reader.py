@@ -99,7 +99,7 @@ class DatasetActions:
         seeds = self.seeds()
         if seeds:
             return seeds[episode].task
-        known = {_words(tasks.get(name).instruction): name for name in tasks.names()}
+        known = {_words(spec.instruction): spec.name for spec in tasks.specs()}
         named = {known.get(_words(text)) for text in self.files.episode_rows[episode].tasks}
         return named.pop() if len(named) == 1 else None
 

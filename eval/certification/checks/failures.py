@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from arena_newton import tasks as task_registry
 from arena_newton.cli.intervals import wilson
 from arena_newton.eval.certification.checks.labelled_failures import agreements, labelled_failures, labelled_sheets
 from arena_newton.eval.certification.context import CertifyCell, Context
@@ -15,7 +16,6 @@ from arena_newton.eval.certification.stand_ins.bodies import Body
 from arena_newton.eval.certification.stand_ins.sabotage import SABOTAGES
 from arena_newton.eval.folders.failure_rules import stage_of
 from arena_newton.eval.folders.failure_stage import FailureStage
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.pages.tables import Table
 
 __all__ = ["CHECKS", "HELD_OUT", "LEAST", "TUNED", "Confusion", "confusion"]
@@ -77,7 +77,7 @@ def confusion(pairs: Sequence[tuple[FailureStage, FailureStage | None]]) -> Conf
 
 def failures(context: Context) -> CheckFinding:
     """Let saboteurs fail, and compare scripted stages with found ones; count how often rules and readers agree."""
-    tasks = [task for task in context.tasks if task in INTERACTIONS]
+    tasks = [task for task in context.tasks if task_registry.get(task).interaction]
     if not tasks:
         return skipped(f"no signals are defined for {' '.join(context.tasks)}")
     real = labelled_failures()
@@ -86,7 +86,7 @@ def failures(context: Context) -> CheckFinding:
     for task in tasks:
         for tracker in context.sample:
             for name, sabotage in SABOTAGES.items():
-                if task in sabotage.without or context.options.quick and task != _quick_task(name):
+                if not sabotage.fits(task) or context.options.quick and task != _quick_task(name):
                     continue
                 episodes = min(QUICK_FAILURES, context.episodes) if context.options.quick else None
                 cell = CertifyCell(task, tracker, body=name, failures=True, first_seed=HELD_OUT, episodes=episodes)
@@ -100,7 +100,7 @@ def failures(context: Context) -> CheckFinding:
     for task in tasks:
         looked_at = " ".join(str(seed) for seed in TUNED.get(task, ())) or "none of its episodes"
         notes.append(f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on {looked_at}")
-    left_out = [task for task in context.tasks if task not in INTERACTIONS]
+    left_out = [task for task in context.tasks if task not in tasks]
     notes += [f"no signals are defined for {' '.join(left_out)}"] if left_out else []
     matrices = {task: confusion(found) for task, found in pairs.items()}
     every = confusion([pair for found in pairs.values() for pair in found])
@@ -127,7 +127,7 @@ def failures(context: Context) -> CheckFinding:
 
 def _quick_task(name: str) -> str | None:
     """The task in which a kind of failure is played under --quick: the kinds go round the tasks."""
-    fit = [task for task in INTERACTIONS if task not in SABOTAGES[name].without]
+    fit = [task for task in TUNED if SABOTAGES[name].fits(task)]
     return fit[list(SABOTAGES).index(name) % len(fit)] if fit else None
 
 

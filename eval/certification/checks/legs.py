@@ -3,40 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
 
+from arena_newton import tasks
 from arena_newton.eval.certification.checks.replays import recorded
 from arena_newton.eval.certification.context import CertifyCell, Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture, Verdict, pooled_score, score
 from arena_newton.files.text import counted
 from arena_newton.pages.tables import Table
 
-__all__ = ["CHECKS", "GLIDES"]
+__all__ = ["CHECKS"]
 
-GLIDES: Mapping[str, str] = {
-    "football": (
-        "the rule asks where the ball goes, not how: the feet that hang from the gliding base meet it as a bumper "
-        "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
-    ),
-    "pp_box": (
-        "the box is on a table and the only empty deck is 0.67 m high, at hip height: arms alone lift the box, hold it "
-        "and set it down, and a base that rolls carries it there. Only a lower deck would ask for a crouch"
-    ),
-    "open_door": (
-        "lever, leaf and doorway are met by hands and body: a base that rolls presses, leans and drives through, and "
-        "the doorway has no sill"
-    ),
-    "boxing": (
-        "the target's centre is 0.75 to 0.85 m high and counts from 0.13 m away, and a pelvis that glides at 0.8 m has "
-        "its shoulders 0.3 m above that: the arms alone reach down to it, from wherever the base rolls"
-    ),
-    "vis_navi": (
-        "the rule asks for both ankle links inside the area's box and an upright robot; legs that hang still from a "
-        "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"
-    ),
-}
-"""Task that a gliding base can solve → why. A base on wheels is not what the rules forbid: they read where hands, feet
-and things are, not how the robot came there."""
 SHOWN = 2
 """Film strips of each task that the page shows."""
 
@@ -92,17 +68,22 @@ def frozen(context: Context) -> CheckFinding:
 
 
 def gliding(context: Context) -> CheckFinding:
-    """Play every task with a base that glides."""
+    """Play every task with a base that glides.
+
+    A base on wheels is not what the rules forbid: they read where hands, feet and things are, not how the robot came
+    there. So a task may say why one solves it (`TaskSpec.without_legs`).
+    """
     found, sheet, pictures = _without_legs(context, "gliding")
     whole = pooled_score(
         [score(context.evaluate(recorded(context, task, tracker))) for tracker in context.sample for task in found]
     )
     solved = {task: count for task, count in found.items() if count}
-    unknown = [task for task in solved if task not in GLIDES]
+    reasons = {task: tasks.get(task).without_legs for task in solved}
+    unknown = [task for task, reason in reasons.items() if not reason]
     needed = [task for task in found if task not in solved]
     summary = f"{sum(found.values())} successes with a gliding base, {whole.successes} with legs; 0 in: "
     summary += " ".join(needed) or "none"
-    notes = [f"{task}, {count} successes: {GLIDES[task]}." for task, count in solved.items() if task in GLIDES]
+    notes = [f"{task}, {solved[task]} successes: {reason}." for task, reason in reasons.items() if reason]
     notes += [f"{task}, {solved[task]} successes: no reason is known, see the pictures." for task in unknown]
     broken = _broken(context, "gliding")
     notes += broken

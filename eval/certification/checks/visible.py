@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 
-from arena_newton import policies
+from arena_newton import policies, tasks
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, Picture
@@ -22,18 +21,8 @@ from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.rules import seeding
 
-__all__ = ["CHECKS", "TARGETS", "first_sights"]
+__all__ = ["CHECKS", "first_sights"]
 
-TARGETS: Mapping[str, str] = {
-    "football": "/World/Ball",
-    "double_desk": "/World/Hammer",
-    "pp_box": "/World/Box",
-    "open_door": "/World/Door/Handle",
-    "sit_sofa": "/World/Sofa",
-    "boxing": "/World/Target",
-    "vis_navi": "/World/TargetSign",
-}
-"""Task → prim of what its instruction names and the robot must find: the area of VisNavi belongs to its sign."""
 SEEN = 10
 """A target is seen from so many pixels on, of the 224 x 168 that the lens fills."""
 EVERY = 10
@@ -49,7 +38,8 @@ def visible(context: Context) -> CheckFinding:
     rows, missing, late, pictures = [], [], [], []
     tracker, shown, total = context.trackers[0], 0, 0
     for task in context.tasks:
-        if task not in TARGETS:
+        target = tasks.get(task).target
+        if not target:
             missing.append(f"{task}: no target is named for it")
             continue
         picture = context.folder / "pictures" / f"visible_{task}.png"
@@ -62,13 +52,13 @@ def visible(context: Context) -> CheckFinding:
         median = str(seen[len(seen) // 2]) if seen else "-"
         latest = str(seen[-1]) if seen else "-"
         never = len(sights) - len(seen)
-        row = (task, TARGETS[task], f"{at_once}/{len(sights)}", f"{int(np.median(pixels))}", median, latest, str(never))
+        row = (task, target, f"{at_once}/{len(sights)}", f"{int(np.median(pixels))}", median, latest, str(never))
         rows.append(row)
         if at_once < len(sights):
             late.append(f"{task}: not in the first picture of {len(sights) - at_once} of {len(sights)} episodes")
         missing += [f"{task}: never seen in {never} of {len(sights)} episodes"] * bool(never)
         if picture.is_file():
-            pictures.append(Picture(f"{task}: {TARGETS[task]} when it is seen first, with its pixels marked", picture))
+            pictures.append(Picture(f"{task}: {target} when it is seen first, with its pixels marked", picture))
     head = (
         "task",
         "target",
@@ -91,7 +81,7 @@ def _look(context: Context, task: str, tracker: str, picture: Path) -> JsonObjec
     """First sights of a task's episodes."""
     seeds = context.seeds(task, min(context.episodes, context.options.worlds))
     env = world_of(context, task, tracker, worlds=len(seeds), camera=CameraConfig())
-    first, pixels, image = first_sights(env, seeds, TARGETS[task])
+    first, pixels, image = first_sights(env, seeds, env.spec.target)
     env.close()
     if image is not None:
         picture.parent.mkdir(parents=True, exist_ok=True)

@@ -131,6 +131,7 @@ class WithOtherLegs(Tracker):
         self.drive, self.original_drive = inner.drive, inner.original_drive
         self.physics_rate, self.fast_physics_rate = inner.physics_rate, inner.fast_physics_rate
         self.ignores, self.max_root_delta_deg = inner.ignores, inner.max_root_delta_deg
+        self.needs, self.lookahead = inner.needs, inner.lookahead
         self._takes_mask = "mask" in inspect.signature(inner.step).parameters
 
     def legs(self, asked: torch.Tensor) -> torch.Tensor:

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from arena_newton import tasks
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.certification.stand_ins.bodies import Body, WithOtherLegs
 from arena_newton.eval.certification.stand_ins.handling import HANDLING
 from arena_newton.eval.folders.failure_stage import FailureStage
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Spawn, World
@@ -31,11 +31,10 @@ from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.policies.experts.base import Expert
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.canonical import ACTION
-from arena_newton.robot.g1 import CANONICAL_JOINTS
+from arena_newton.robot.g1 import CANONICAL_JOINTS, PALMS
 from arena_newton.robot.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.football import GOAL
-from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.motions.commands import MotionCommand
 
@@ -252,12 +251,12 @@ class BlindExpert(MisledExpert):
         turn = self.style.uniform("to", math.radians(least), math.radians(most))
         if self.env.spec.name == "football":  # on the other half of the pitch
             turn = torch.where(self.sight.view.centre[:, 0] > 0.0, math.pi - turn, turn)
-        far = FARTHER if self.env.spec.name == "sit_sofa" else ELSEWHERE
+        far = FARTHER if self.sight.view.spec.behind else ELSEWHERE
         self.sight.object_off = self._elsewhere(_level(self.style.uniform("far", *far), turn))
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""
-        return _upright(command) if self.env.spec.name == "sit_sofa" else command
+        return _upright(command) if self.sight.view.spec.behind else command
 
     def _elsewhere(self, aside: Tensor) -> Tensor:
         if self.env.spec.name != "boxing":
@@ -281,7 +280,7 @@ class MisaimedExpert(MisledExpert):
         if self.env.spec.name == "football":
             self.sight.object_off = _level(self.style.uniform("short", *BEFORE_BALL), aside - 0.5 * math.pi)
             return
-        if self.env.spec.name == "sit_sofa":
+        if self.sight.view.spec.behind:
             self.sight.object_off = _level(self.style.uniform("short", *BESIDE_SEAT), torch.zeros_like(far))
             return
         if view.spec.level:  # a place is missed as a whole, on the side from which the robot comes
@@ -293,7 +292,7 @@ class MisaimedExpert(MisledExpert):
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""
-        return _upright(command) if self.env.spec.name == "sit_sofa" else command
+        return _upright(command) if self.sight.view.spec.behind else command
 
 
 class UnbalancedExpert(MisledExpert):
@@ -334,7 +333,7 @@ class ReluctantExpert(MisledExpert):
 
     def overrule(self, command: MotionCommand) -> MotionCommand:
         """See `MisledExpert.overrule`."""
-        if self.env.spec.name == "sit_sofa":
+        if self.sight.view.spec.behind:
             return _upright(command)
         view, (halt, course) = self.sight.view, (self.handling.halts, HALTS[1]) if self.handling else HALTS
         before = view.bearing <= view.spec.bearing
@@ -371,7 +370,7 @@ class ClumsyExpert(MisledExpert):
         """See `MisledExpert.overrule`."""
         if self.handling:
             return self.handling.let_go(command, self.style, self.after)
-        return self._perched(command) if self.env.spec.name == "sit_sofa" else command
+        return self._perched(command) if self.sight.view.spec.behind else command
 
     def _perched(self, command: MotionCommand) -> MotionCommand:
         height = torch.maximum(command.height, self.style.uniform("perched", *PERCHED))
@@ -511,6 +510,12 @@ class Sabotage:
     without: tuple[str, ...] = ()
     """Tasks in which there is no such failure."""
 
+    def fits(self, task: str) -> bool:
+        """True if there is such a failure in a task: a touch that is all that is wanted has no effect to miss."""
+        touch = tasks.get(task).interaction
+        reached = touch is not None and touch.reached_only and self.stage is FailureStage.CONTACT
+        return task not in self.without and not reached
+
 
 def _expert(expert: type[MisledExpert], env: type[ArenaEnv] | None = None) -> Callable[[Factories], Factories]:
     def equip(factories: Factories) -> Factories:
@@ -531,8 +536,6 @@ def _weak(factories: Factories) -> Factories:
     return dataclasses.replace(factories, tracker=tracker, env=env)
 
 
-_NO_EFFECT = ("vis_navi",)
-"""Tasks whose object is only to be reached: a touch has no effect that could fail to come."""
 _MADE = (
     (FailureStage.PERCEPTION, "blinded", "expert that does not see the object", _expert(BlindExpert)),
     (FailureStage.APPROACH, "misaimed", "expert that stops beside its place", _expert(MisaimedExpert)),
@@ -542,14 +545,13 @@ _MADE = (
     (FailureStage.TRACKING, "weakened", "tracker with weak legs", _weak),
 )
 SABOTAGES: dict[str, Sabotage] = {
-    name: Sabotage(stage, Body(name, title, equip), _NO_EFFECT if stage is FailureStage.CONTACT else ())
-    for stage, name, title, equip in _MADE
+    name: Sabotage(stage, Body(name, title, equip)) for stage, name, title, equip in _MADE
 }
 SABOTAGES |= {
     "reluctant": Sabotage(
         FailureStage.POSTURE,
         Body("reluctant", "expert that stands before the object", _expert(ReluctantExpert)),
-        tuple(task for task in INTERACTIONS if task in ("boxing", "vis_navi", "double_desk")),
+        ("boxing", "vis_navi", "double_desk"),
     )
 }
 """Scripted failures by name."""

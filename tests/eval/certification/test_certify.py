@@ -1,5 +1,6 @@
 """`eval certify` as a command: verdicts become lines, a page and an exit code, and a stopped one goes on."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
 
+from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.certification import certificate, certify, certify_options, claims
@@ -88,7 +90,7 @@ def read(folder):
 
 
 def test_a_sound_benchmark_passes(tmp_path, capsys):
-    """Solvable tasks that need legs and a swap that costs success: a line each, three files, exit code 0."""
+    """Solvable tasks that need legs and a swap that costs success: a line each, pages, exit code 0."""
     assert certify.run(options(tmp_path / "o"), factories(**PARTS), bodies=LEGS, checks=CHECKS) == 0
     lines = capsys.readouterr().out.splitlines()
     for name in ("solvable", "frozen-legs", "gliding-base", "swap"):
@@ -132,10 +134,10 @@ def test_tasks_that_need_no_legs_are_named(tmp_path, envs, name, verdict, said):
 
 def test_a_gliding_base_without_a_known_reason_fails(tmp_path, monkeypatch):
     """A task that a gliding base solves and that no sentence explains fails the benchmark."""
-    monkeypatch.setattr(legs, "GLIDES", {})
+    monkeypatch.setattr("arena_newton.tasks.boxing.TASK", dataclasses.replace(tasks.get("boxing"), without_legs=""))
     given = options(tmp_path, checks=("gliding-base",))
     assert certify.run(given, factories(**PARTS), bodies=bodies(gliding=SolvedEnv), checks=CHECKS) == 1
-    assert "no reason is known" in read(tmp_path)["gliding-base"]["notes"][0]
+    assert "boxing, 4 successes: no reason is known" in " ".join(read(tmp_path)["gliding-base"]["notes"])
 
 
 def test_unsolved_tasks_fail(tmp_path, capsys):
@@ -269,6 +271,37 @@ def test_a_damaged_measurement_is_measured_again(tmp_path, text):
     assert look() == measured[1]
 
 
+FACTS = {
+    "tasks": ["boxing"],
+    "without_expert": [],
+    "trackers": ["twist2"],
+    "episodes": 4,
+    "quick": True,
+    "engine": "mujoco",
+    "device": "cpu",
+    "code": "0" * 12,
+    "planned": ["legs", "swap"],
+    "command": "python -m arena_newton.eval certify --quick",
+    "cores": 2,
+    "versions": {"python": "3.12", "arena-newton": "1.2.3"},
+}
+
+
+def test_evidence_is_in_pages_that_can_be_read():
+    """Rows that differ in task, tracker or rules alone are one; a page has at most 250 lines, and claims lead to it."""
+    rows = [(task, tracker, "20/20") for tracker in ("twist2", "sonic") for task in ("boxing", "vis_navi")]
+    sheet = Table(("task", "tracker", "successes"), [*rows, ("football", "sonic", "19/20")])
+    long = Table(("number",), [(number,) for number in range(100)])
+    findings = {Check(n, "?", print): CheckFinding("pass", "x", (sheet, long)) for n in ("solvable", "swap", "sill")}
+    pages = certificate.markdown(FACTS, findings)
+    assert list(pages) == ["certify.md", "certify_1.md", "certify_2.md"]
+    assert all(page.count("\n") <= 250 for page in pages.values())
+    for check, number in (("solvable", 1), ("swap", 1), ("sill", 2)):
+        assert f"(certify_{number}.md#{check}-pass)" in pages["certify.md"]
+        assert f"## {check}: pass" in pages[f"certify_{number}.md"]
+    assert "| boxing, vis_navi | twist2, sonic | 20/20 |\n| football | sonic | 19/20 |" in pages["certify_2.md"]
+
+
 def test_the_page_needs_no_other_file(tmp_path):
     """Pictures are inside, texts stay texts, and what is missing is named."""
     picture = tmp_path / "strip.png"
@@ -281,30 +314,16 @@ def test_the_page_needs_no_other_file(tmp_path):
         ("a | note",),
         (Picture('a "picture"', picture),),
     )
-    facts = {
-        "tasks": ["boxing"],
-        "without_expert": [],
-        "trackers": ["twist2"],
-        "episodes": 4,
-        "quick": True,
-        "engine": "mujoco",
-        "device": "cpu",
-        "code": "0" * 12,
-        "planned": ["legs", "swap"],
-        "command": "python -m arena_newton.eval certify --quick",
-        "cores": 2,
-        "versions": {"python": "3.12", "arena-newton": "1.2.3"},
-    }
-    certificate.write(tmp_path, facts, {check: found})
+    certificate.write(tmp_path, FACTS, {check: found})
     page = (tmp_path / "certify.html").read_text()
     addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(address.startswith(("#", "data:image/png;base64,")) for address in addresses)
     assert "data:image/png;base64," in page and "<script>" not in page and "&lt;script&gt;" in page
     assert "1 of 2 checks have not run" in page and "intervals are wide" in page and "not asked for: journal" in page
     assert page.index("Not finished") < page.index('id="claims"') < page.index("2 CPU cores") < page.index("A table")
-    text = (tmp_path / "certify.md").read_text()
-    assert r"a \| note" in text and "data:" not in text
-    assert "[legs](#legs-note): three of four" in text and "## legs: note" in text
+    text, evidence = ((tmp_path / name).read_text() for name in ("certify.md", "certify_1.md"))
+    assert r"a \| note" in evidence and "data:" not in text + evidence
+    assert "[legs](certify_1.md#legs-note): three of four" in text and "## legs: note" in evidence
     stored = json.loads((tmp_path / "certify.json").read_text())
     assert not stored["complete"] and stored["checks"]["legs"]["pictures"][0]["path"] == "strip.png"
 

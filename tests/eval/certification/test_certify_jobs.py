@@ -10,11 +10,11 @@ import pytest
 import tyro
 
 import arena_newton
+from arena_newton import tasks
 from arena_newton.eval.certification import jobs
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import agreement
 from arena_newton.eval.certification.checks.failures import failures
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.pages.tables import Table
 
 
@@ -97,7 +97,7 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     """Ctrl-C ends the processes that play and starts no other one."""
     log = stand_in(tmp_path, monkeypatch)
     program = tmp_path / "python"
-    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 60\n')
+    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 600\n')
 
     def interrupt():
         while not log.exists() or log.read_text().count("\n") < 2:
@@ -109,7 +109,7 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["football", "boxing"], ["solvable"], lambda text: None)
     both.join()
-    assert time.monotonic() - began < 30.0 and log.read_text().count("\n") == 2
+    assert time.monotonic() - began < 300.0 and log.read_text().count("\n") == 2
 
 
 def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path, monkeypatch):
@@ -137,7 +137,7 @@ def test_a_process_of_a_quick_certification_compares_no_rates_on_a_cpu(monkeypat
 
 def test_a_quick_check_of_any_task_has_an_outcome():
     """Also of a task in which none of the kinds is scripted then: the real failures are read all the same."""
-    for task in INTERACTIONS:
+    for task in tasks.names():
         given = {"tasks": (task,), "sample": ("twist2",), "evaluate": lambda cell: [], "episodes": 2}
         found = failures(SimpleNamespace(options=SimpleNamespace(quick=True), **given))
         assert found.verdict == "pass" and "0 of 0 scripted" in found.summary

@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 from eval_fakes import factories
@@ -16,6 +15,7 @@ from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import machines
 from arena_newton.eval.certification.checks.same_files import contents
 from arena_newton.eval.workers.shard_merge import merge
+from tests.patience import wait_for
 
 
 def certified(folder, check, **changes):
@@ -41,14 +41,6 @@ def by_copy(monkeypatch):
         monkeypatch.setattr(machines, "play_by_ray", play)
 
     return use
-
-
-def wait_for(condition, seconds=20.0):
-    """Wait until something holds."""
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "it does not happen"
-        time.sleep(0.01)
 
 
 def edit(path, old, new):
@@ -165,16 +157,16 @@ def test_an_actor_is_found_and_killed(tmp_path, monkeypatch):
     """The process below a run that plays is killed, once an episode has ended and not before."""
     monkeypatch.setattr(machines, "POLL", 0.01)
     (tmp_path / "episodes.jsonl").write_text("")
-    waits = "import time; time.sleep(60)"
+    waits = "import time; time.sleep(600)"
     idle, plays = (f'(exec -a ray::RayActor{what} {sys.executable} -c "{waits}")' for what in ("", ".play"))
     run = subprocess.Popen(["bash", "-c", f"{idle} & other=$!; {plays}; touch {tmp_path}/gone; kill $other"])
     try:
-        wait_for(lambda: machines._actors(run.pid))
+        wait_for(lambda: machines._actors(run.pid), "actor")
         assert len(machines._actors(run.pid)) == 1 and not (tmp_path / "gone").exists()
         timer = threading.Timer(0.1, lambda: (tmp_path / "episodes.jsonl").write_text("{}\n{}\n"))
         timer.start()
         assert machines._kill_one(run, tmp_path) == 2
-        wait_for((tmp_path / "gone").exists)
+        wait_for((tmp_path / "gone").exists, "end of the actor")
         assert not machines._actors(run.pid)
     finally:
         run.kill()

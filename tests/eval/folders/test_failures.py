@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from made_folders import document_of, folder_with
-from made_signals import UNTOUCHED, WELL, signals
+from made_signals import UNTOUCHED, WELL, signals, without_signals
 from rows import episodes, full, record
 
 from arena_newton import tasks, trackers
@@ -40,7 +40,6 @@ from arena_newton.eval.folders.failure_counts import failure_cells
 from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_start, stage_of, waits_in_view
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.folders.results import OWN_FOLDER, load_run
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.own_tracker import own_options
@@ -49,10 +48,10 @@ from arena_newton.eval.play.signal_recorder import SEEN, SignalRecorder
 from arena_newton.eval.records.journal import EpisodeRecord, Journal, read_journal
 from arena_newton.eval.reports import report
 from arena_newton.policies.experts import ExpertPolicy, Sight
-from arena_newton.robot.g1 import DEFAULT_POSE, LEGS
+from arena_newton.robot.g1 import DEFAULT_POSE, LEGS, TOE
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-from arena_newton.tasks.football import BALL, GOAL, TOE
+from arena_newton.tasks.football import BALL, GOAL
 from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}
@@ -93,9 +92,8 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
         ("tracking (legs)", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
     ],
 )
-def test_signals_name_a_stage(monkeypatch, stage, outcome, changes):
-    """Each stage has its picture of signals, in tasks of other names by what their entries declare."""
-    monkeypatch.setitem(INTERACTIONS, "push_bin", dataclasses.replace(INTERACTIONS["vis_navi"], carried=True))
+def test_signals_name_a_stage(push_bin, stage, outcome, changes):
+    """Each stage has its picture of signals, in tasks of other names by what their records declare."""
     assert stage_of(judged(outcome, **changes)) == stage
 
 
@@ -115,7 +113,8 @@ def test_a_touch_is_one_that_the_journal_knows():
     assert stage_of(judged(**touched)) == "contact"  # a line of schema 1
     assert stage_of(judged("fall", task="pp_box", predicates={"contact": 880})) == "posture"  # a part of the fall
     assert stage_of(judged(predicates={"contact": None})) == "contact"  # Boxing's is its success
-    for task, spec in INTERACTIONS.items():
+    for task in tasks.names():
+        spec = tasks.get(task).interaction
         assert not spec.predicate or spec.predicate in [one.name for one in tasks.get(task).predicates][:-1]
 
 
@@ -349,7 +348,7 @@ OF = {
 
 def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     """Scripted failures with their stages pass; one kind that is mostly taken for another fails and is named."""
-    monkeypatch.delitem(INTERACTIONS, "football")
+    without_signals(monkeypatch, "football")
     assert set(OF) == set(SABOTAGES)
     assert {SABOTAGES[name].stage for name in OF} == set(FailureStage)
     good = failures(played(lambda body: OF[body] * 5))
@@ -373,7 +372,7 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     assert "1.00 rules with reader 2" in unlike.summary
 
 
-def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
+def test_the_check_plays_episodes_that_nothing_was_set_on(push_bin, agreed):
     """Its group seeds lie above all that were looked at, whatever their number, and a note says both."""
     cells = []
 
@@ -381,10 +380,11 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
         cells.append(cell)
         return [judged(outcome, **changes) for outcome, changes in OF[cell.body] * 5]
 
-    monkeypatch.setitem(INTERACTIONS, "push_bin", INTERACTIONS["boxing"])  # an entry, and nothing else
-    context = vars(played(None)) | {"tasks": tuple(INTERACTIONS), "evaluate": evaluate}
+    context = vars(played(None)) | {"tasks": tasks.names(), "evaluate": evaluate}
     found = failures(SimpleNamespace(**context))
-    scripted = [(task, name) for task in INTERACTIONS for name, one in SABOTAGES.items() if task not in one.without]
+    scripted = [(task, name) for task in tasks.names() for name, one in SABOTAGES.items() if one.fits(task)]
+    reached = [task for task in tasks.names() if (task, "clumsy") not in scripted]
+    assert reached == ["vis_navi", push_bin]
     assert [(cell.task, cell.body) for cell in cells] == scripted
     said = f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none"
     assert said in " ".join(found.notes)
@@ -392,7 +392,7 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(monkeypatch, agreed):
         assert max(looked_at) < HELD_OUT
         said = f"{task}: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on "
         assert said + " ".join(map(str, looked_at)) in found.notes
-    assert {(cell.task, cell.first_seed) for cell in cells} == {(task, HELD_OUT) for task in INTERACTIONS}
+    assert {(cell.task, cell.first_seed) for cell in cells} == {(task, HELD_OUT) for task in tasks.names()}
 
 
 @pytest.mark.parametrize(("count", "seeds"), [(4, 1), (20, 1), (60, 3)])
@@ -408,7 +408,7 @@ def test_a_cell_may_begin_at_another_group_seed(tmp_path, count, seeds):
 
 def test_tasks_without_signals_are_refused(capsys, monkeypatch):
     """--failures says of which tasks there are none, and plays nothing."""
-    monkeypatch.delitem(INTERACTIONS, "football")
+    without_signals(monkeypatch, "football")
     assert main(["run", "--failures", "--task", "football", "boxing", "--out", "nowhere"]) == 2
     error = capsys.readouterr().err
     assert "--failures: no signals are defined for football" in error and error.count("\n") == 1
@@ -447,7 +447,7 @@ def test_a_misled_sight_displaces_what_it_says(boxing):
     truth, misled = ExpertPolicy(), ExpertPolicy(MisledSight)
     truth.attach(boxing)
     misled.attach(boxing)
-    target, palm = INTERACTIONS["boxing"].box, INTERACTIONS["boxing"].effectors[0]
+    target, palm = boxing.spec.interaction.box, boxing.spec.interaction.effectors[0]
     readers = [(one.sight.frame(target), one.sight.frame(palm)) for one in (truth, misled)]
     off = misled.sight.object_off.new_tensor([0.1, 0.2, 0.3])
     misled.sight.object_off += off
@@ -474,7 +474,7 @@ def test_a_ball_is_touched_with_the_toe_and_moved_as_a_free_body(football):
     env.reset([SEEDS[0]])
     view, ball = env.view, env.scene.joint_qpos(BALL)
     data, gaps = env.physics.data[0], []
-    for link in INTERACTIONS["football"].effectors:
+    for link in env.spec.interaction.effectors:
         body = env.scene.link(link)
         toe = data.xpos[body] + data.xmat[body].reshape(3, 3) @ TOE
         gaps.append(np.linalg.norm((np.abs(toe - view.centre[0].numpy()) - view.box.half).clip(0.0)))

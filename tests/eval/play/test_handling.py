@@ -24,7 +24,6 @@ from arena_newton.eval.certification.stand_ins.sabotage import (
     UnbalancedExpert,
     WeakTracker,
 )
-from arena_newton.eval.plan.interaction import INTERACTIONS
 from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.policies.experts import Sight
@@ -81,7 +80,7 @@ def test_blind_robots_believe_the_object_where_the_table_says(task, style):
     """They are far off, in the table's directions."""
     handling = HANDLING[task]
     far = handling.elsewhere(style, (2.4, 3.2))
-    assert (far.norm(dim=1) > INTERACTIONS[task].near).all() and not far[:, 2].any()
+    assert (far.norm(dim=1) > tasks.get(task).interaction.near).all() and not far[:, 2].any()
     turn = torch.atan2(far[:, 1], far[:, 0]).remainder(2 * math.pi)
     least, most = (math.radians(angle) for angle in handling.blind)
     assert ((turn > least - 1e-4) & (turn < most + 1e-4)).all()
@@ -125,7 +124,7 @@ def test_a_stubborn_robot_believes_a_box_where_it_was(envs):
     policy = StubbornExpert()
     policy.attach(env)
     policy.reset([1, 2], ["pp_box"] * WORLDS)
-    read = policy.sight.frame(INTERACTIONS["pp_box"].box)
+    read = policy.sight.frame(tasks.get("pp_box").interaction.box)
     policy.act(env.observe())
     before = read().clone()
     env._relocate(0)
@@ -149,7 +148,7 @@ def test_everything_of_a_door_is_believed_elsewhere(envs):
     desk = envs("double_desk")
     sight, true = MisledSight(desk), Sight(desk)
     sight.object_off += torch.tensor([0.0, 0.0, 0.5])
-    hammer = INTERACTIONS["double_desk"].box
+    hammer = tasks.get("double_desk").interaction.box
     assert (sight.com(hammer)() - true.com(hammer)())[:, 2].numpy() == pytest.approx([0.5, 0.5])
 
 
@@ -159,7 +158,7 @@ def test_a_carried_object_has_moved_from_where_hands_left_it(envs):
     acting(env)
     recorder = SignalRecorder(env)
     recorder.start(env, 0, SimpleNamespace(index=0))
-    body, spec = env.scene.joint_qpos(INTERACTIONS["pp_box"].box), recorder.spec
+    body, spec = env.scene.joint_qpos(env.spec.interaction.box), recorder.spec
 
     def moved(touch, way):
         view = recorder._view

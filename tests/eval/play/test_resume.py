@@ -7,7 +7,6 @@ import re
 import shutil
 import signal
 import sys
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -23,6 +22,7 @@ from arena_newton.eval.records import journal as journal_module
 from arena_newton.policies.base import PolicyUnavailable
 from arena_newton.rules import seeding
 from tests.children import Child
+from tests.patience import PLENTY, wait_for
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
@@ -68,25 +68,25 @@ def journal(folder):
     return [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
 
 
-def start(folder, *flags):
-    """The command line in a process of its own."""
-    return Child("eval_fakes", ["run", *FLAGS, *flags, "--out", str(folder)], FAKE_TICK_S="0.01")
+@pytest.fixture
+def start(tmp_path, uninterrupted):
+    """Starts the command line in a process of its own, which stops in the plan's second half."""
+    poison = tmp_path / "poison.txt"
+    poison.write_text(f"hang {journal(uninterrupted)[40]['episode_seed']}")
 
-
-def wait_for_lines(process, folder, n):
-    """Wait until the journal holds n lines."""
-    deadline = time.monotonic() + 60
-    while lines(folder) < n:
+    def start(folder, *flags):
+        process = Child("eval_fakes", ["run", *FLAGS, *flags, "--out", str(folder)], FAKE_POISON=str(poison))
+        wait_for(lambda: lines(folder) > 6 or process.poll() is not None, "line of the journal")
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+        return process
+
+    return start
 
 
-def test_kill_and_resume_gives_the_same_bytes(tmp_path, uninterrupted):
+def test_kill_and_resume_gives_the_same_bytes(tmp_path, uninterrupted, start):
     """`kill -9` in the middle, with a torn last line, then resume: every table equals the undisturbed run's."""
     folder = tmp_path / "b"
     process = start(folder, "--worlds", "5")
-    wait_for_lines(process, folder, 7)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     before = lines(folder)
@@ -112,13 +112,12 @@ def test_environments_are_stored_in_the_plans_order(tmp_path):
     assert list(stored) == names and stored[names[1]] == {"engine": names[1]}
 
 
-def test_interrupt_says_how_to_go_on(tmp_path, uninterrupted):
+def test_interrupt_says_how_to_go_on(tmp_path, uninterrupted, start):
     """Ctrl-C ends with code 130, keeps what was finished and prints the command that continues."""
     folder = tmp_path / "with space"
     process = start(folder)
-    wait_for_lines(process, folder, 3)
     process.send_signal(signal.SIGINT)
-    output, complaint = process.communicate(timeout=60)
+    output, complaint = process.communicate(timeout=PLENTY)
     assert process.returncode == 130, complaint
     assert f"resume '{folder}'" in output
     assert "Traceback" not in complaint

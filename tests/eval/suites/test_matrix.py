@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import time
 
 import pytest
 from eval_fakes import FakeEnv, FakePolicy, factories
@@ -19,6 +18,7 @@ from arena_newton.eval.suites.matrix_cells import dealt, expand_cells, parse_onl
 from arena_newton.eval.suites.suite_file import SHIPPED, read_suite_file
 from arena_newton.eval.suites.suite_records import load_cell, read_events, read_suite
 from tests.children import Child
+from tests.patience import PLENTY, wait_for
 
 
 @pytest.fixture
@@ -92,26 +92,19 @@ def test_a_finished_suite_plays_nothing(played, suite, capsys):
     assert (played / "suite.1-of-1.jsonl").read_bytes() == before
 
 
-def start(suite, out, *flags, pause="0.005"):
-    """The command line in a process of its own."""
-    return Child("eval_fakes", ["matrix", str(suite), "--out", str(out), *flags], FAKE_TICK_S=pause)
-
-
-def wait_for(process, out, text):
-    """Wait until the suite's journal holds a text."""
-    deadline = time.monotonic() + 90
-    path = out / "suite.1-of-1.jsonl"
-    while not (path.exists() and text in path.read_text()):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+def start(suite, out, *flags, hangs="expert still", shard="1-of-1", begins="begun"):
+    """The command line in a process of its own whose policies hang, once the suite's journal holds a text."""
+    process = Child("eval_fakes", ["matrix", str(suite), "--out", str(out), *flags], FAKE_HANGS=hangs)
+    path = out / f"suite.{shard}.jsonl"
+    wait_for(lambda: path.exists() and begins in path.read_text() or process.poll() is not None, "cell that is played")
+    assert process.poll() is None, process.communicate()
+    return process
 
 
 def test_kill_and_again_gives_the_same_episodes(suite, played, tmp_path):
     """`kill -9` within a cell, with a torn last line, then the same command: every cell equals the undisturbed one."""
     out = tmp_path / "killed"
-    process = start(suite, out)
-    wait_for(process, out, '"cell":"still/twist2/boxing/base","event":"begun"')
+    process = start(suite, out, hangs="still", begins='"cell":"still/twist2/boxing/base","event":"begun"')
     process.send_signal(signal.SIGKILL)
     process.communicate()
     with (out / "suite.1-of-1.jsonl").open("ab") as file:
@@ -128,12 +121,11 @@ def test_kill_and_again_gives_the_same_episodes(suite, played, tmp_path):
 def test_interrupt_says_how_to_go_on(suite, tmp_path, capsys):
     """Ctrl-C ends with code 130 and prints the command that continues; a second process is refused meanwhile."""
     out = tmp_path / "with space"
-    process = start(suite, out, "--only", "task=boxing", pause="0.2")
-    wait_for(process, out, "begun")
+    process = start(suite, out, "--only", "task=boxing")
     assert call(suite, out) == 2
     assert "another process plays this suite" in capsys.readouterr().err
     process.send_signal(signal.SIGINT)
-    output, complaint = process.communicate(timeout=60)
+    output, complaint = process.communicate(timeout=PLENTY)
     assert process.returncode == 130, complaint
     assert f"--out '{out}' --only task=boxing" in output and "0 of 3 cells done" in output
     assert "Traceback" not in complaint
@@ -231,12 +223,8 @@ def test_shards_of_two_folders_merge_by_copying(suite, played, tmp_path):
 def test_shards_share_a_folder(suite, tmp_path):
     """A shard plays next to another one in the same folder; the same shard, another count or all cells do not."""
     out = tmp_path / "out"
-    process = start(suite, out, "--shard", "1/2", pause="0.2")
+    process = start(suite, out, "--shard", "1/2", shard="1-of-2")
     try:
-        deadline = time.monotonic() + 60
-        while not list(out.glob("suite.1-of-2.jsonl")) or not list(out.glob("*/*/*/*/episodes.jsonl")):
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.02)
         for flags in ((), ("--shard", "1/2"), ("--shard", "1/3")):
             assert call(suite, out, *flags) == 2, flags
         assert call(suite, out, "--shard", "2/2", "--limit", "1") == 0

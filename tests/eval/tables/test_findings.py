@@ -147,8 +147,8 @@ def test_merged_training_is_judged_by_its_own_trackers():
 
 
 def test_declared_spreads_are_those_of_the_page():
-    """The standard deviations between trainings are the pooled ones of the results' table of three trainings."""
-    page = (RESULTS / "README.md").read_text().split("## One training is one sample")[1].split("\n## ")[0]
+    """The standard deviations between trainings are the pooled ones of the table of three trainings."""
+    page = (RESULTS / "trainings.md").read_text().split("## One training is one sample")[1].split("\n## ")[0]
     rows = {
         line.split("|")[1].strip(): [int(n) for n in re.findall(r"\| (\d+)", line)]
         for line in page.splitlines()

@@ -13,9 +13,10 @@ from made_folders import SUITE, contents, journals
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.workers.shard_merge import merge
+from tests.patience import wait_for
 
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
-from ray_nodes import RAY, Nodes, actors, descendants, free_port, kill_all, wait_for  # noqa: E402  # its psutil comes with Ray
+from ray_nodes import RAY, Nodes, actors, descendants, free_port, kill_all  # noqa: E402  # its psutil comes with Ray
 
 ROOT = Path(__file__).resolve().parents[3]
 FAKES = Path(__file__).parents[1] / "fakes_by_name.py"
@@ -88,7 +89,7 @@ def test_kill_9_in_a_job_of_two_machines(alone, tmp_path):
         )
     out = tmp_path / "out"
     try:
-        wait_for(lambda: len(actors(job.pid)) == 2 and len(lines(out)) >= 2 or job.poll() is not None, 300)
+        wait_for(lambda: len(actors(job.pid)) == 2 and len(lines(out)) >= 2 or job.poll() is not None, "episodes", 300)
         assert job.poll() is None, (tmp_path / "said.txt").read_text()
         # Of the machines that the job began the one that is not the head, which began first.
         machines = [process for process in descendants(job.pid) if process.name() == "raylet"]
@@ -113,7 +114,7 @@ def test_poison_and_a_deadline(nodes, alone, poison, tmp_path):
     poison.write_text(f"die {dies['episode_seed']} hang {hangs['episode_seed']}")
     try:
         run = start(nodes, tmp_path / "run", "--ray-attempts", "1", "--ray-minutes", "0.15")
-        said, _ = run.communicate(timeout=240)
+        said, _ = run.communicate(timeout=500)
     finally:
         poison.unlink()
     assert run.returncode == 1, said
@@ -153,9 +154,9 @@ def test_kill_9_in_a_suite(nodes, tmp_path):
             def another(least=begun + 1):
                 return len(list((tmp_path / "ray").glob("*/*/*/*/episodes.jsonl"))) >= least and nodes.actors()
 
-            wait_for(another, 200)
+            wait_for(another, "cell of another process", 300)
             os.kill(nodes.actors()[killed % len(nodes.actors())], 9)
-        said, _ = run.communicate(timeout=240)
+        said, _ = run.communicate(timeout=500)
     finally:
         run.kill()
     assert run.returncode == 0, said

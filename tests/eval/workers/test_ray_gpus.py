@@ -10,9 +10,10 @@ import pytest
 from made_folders import SUITE, journals
 
 from arena_newton.eval.suites.suite_records import read_suite
+from tests.patience import wait_for
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
-from ray_nodes import Nodes, wait_for  # noqa: E402  # its psutil comes with Ray
+from ray_nodes import Nodes  # noqa: E402  # its psutil comes with Ray
 
 FAKES = Path(__file__).parents[1] / "fakes_with_gpus.py"
 
@@ -24,7 +25,7 @@ def cluster(tmp_path_factory):
     environment = {"FAKE_GPUS": str(folder / "gpus.txt"), "FAKE_TICK_S": "0.1"}
     found = Nodes(folder / "log.txt", environment, cores=4, gpus=2)
     try:
-        wait_for(lambda: "Ray runtime started" in (folder / "log.txt").read_text())
+        wait_for(lambda: "Ray runtime started" in (folder / "log.txt").read_text(), "cluster")
         yield found, folder
     finally:
         found.stop()
@@ -37,7 +38,7 @@ def play(cluster, out, *flags):
     (folder / "gpus.txt").unlink(missing_ok=True)
     command = [sys.executable, str(FAKES), "matrix", str(folder / "suite.toml"), "--out", str(out)]
     environment = os.environ | nodes.token | {"FAKE_GPUS": str(folder / "gpus.txt")}
-    done = subprocess.run([*command, *flags], env=environment, capture_output=True, text=True, timeout=240)
+    done = subprocess.run([*command, *flags], env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
     seen = dict(line.split(" ", 1) for line in (folder / "gpus.txt").read_text().splitlines())
     assert {cell.device for cell in read_suite(out).cells} == {"a GPU"}
@@ -66,7 +67,7 @@ with in_cluster(()):
 @pytest.mark.release
 def test_each_process_sees_its_gpu():
     """Processes with a GPU each see GPU 0 and GPU 1; with half a GPU each two of four see the same one."""
-    done = subprocess.run([sys.executable, "-c", CREW], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", CREW], capture_output=True, text=True, timeout=500)
     assert done.stdout.splitlines() == ["2 0 1", "4 0 0 1 1"], done.stderr
 
 

@@ -206,7 +206,7 @@ class SocketServer(Recorder):
         if kind in wrong:
             socket.send(self.pack(wrong[kind]))
         elif kind == "slow":
-            self.release.wait(20.0)
+            self.release.wait(600.0)
         elif kind == "text":
             socket.send(TRACEBACK)
             socket.close(1011, "Internal server error. Traceback included in previous frame.")
@@ -377,7 +377,7 @@ class Gr00tServer(Recorder):
                 chunk[i, :, 20] = np.nan
         kind = next((kind for kind in faults if kind and kind != "nan"), "")
         if kind == "slow":
-            self.release.wait(20.0)
+            self.release.wait(600.0)
         if kind == "text":
             return {"error": "CUDA out of\nmemory"}
         if kind == "ERROR":
@@ -405,7 +405,7 @@ class Gr00tServer(Recorder):
     def kill(self):
         self.running = False
         self.release.set()
-        self.thread.join(5.0)
+        self.thread.join(60.0)
 
     close = kill
 

@@ -23,6 +23,7 @@ from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import make_policy, open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.rollout import Rollout
+from tests.patience import PLENTY
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "checkpoints"))
 import made_checkpoints
@@ -103,7 +104,7 @@ def test_one_checkpoint_through_every_protocol(checkpoint):
     env, ends = None, {}
     for name in ("", "arena", "openpi", "openpi raw", "roboarena", "vla-eval", "vla-eval raw", "gr00t"):
         url, close = started(name, checkpoint) if name else ("", lambda: None)
-        policy = policies.get(f"remote:{url}", timeout=30.0) if name else policies.get(f"lerobot:{checkpoint}")
+        policy = policies.get(f"remote:{url}", timeout=PLENTY) if name else policies.get(f"lerobot:{checkpoint}")
         policy.check()
         if name:
             raw = "raw" in name or name == "gr00t"

