@@ -5,7 +5,7 @@
 
 from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state
 from arena_newton.differentiable.engine_step import EngineState, EngineStep
-from arena_newton.differentiable.estimates import Differences, Played, central_differences, play
+from arena_newton.differentiable.estimates import Differences, Played, central_differences, cross_entropy, play
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 
@@ -20,6 +20,7 @@ __all__ = [
     "ball_flight",
     "central_differences",
     "closed_loop",
+    "cross_entropy",
     "play",
     "reference_step",
     "reset_state",
