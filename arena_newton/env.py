@@ -66,6 +66,7 @@ class ArenaEnv:
         variant_file: str | None = None,
         fast_physics: bool = False,
         drive: DriveGains | None = None,
+        hands: str = "dex3",
         camera: CameraConfig | None = None,
         cameras: Mapping[str, CameraConfig] | None = None,
         threads: int | None = None,
@@ -83,6 +84,7 @@ class ArenaEnv:
             variant_file: A user's USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
             drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
+            hands: `dex3`, or `fixed`: hands without joints, for tasks without grasps.
             camera: Head camera for policies that see: the same as `cameras={"front": camera}`.
             cameras: Cameras for policies that see, by the names of their pictures (`CameraConfig.named`).
             threads: CPU threads of engine `mujoco`; all by default.
@@ -115,6 +117,7 @@ class ArenaEnv:
             self.spec.name,
             worlds=self.worlds,
             device=device,
+            hands=hands,
             variant=None if variant_file and variant == "base" else variant,
             rules=self.rules,
             drive=self.drive,
@@ -198,6 +201,7 @@ class ArenaEnv:
             "startup_ticks": self.startup_ticks,
             "history": self.rules.startup.history,
             "tracker": self.tracker.describe(),
+            **({} if self.scene.hands == "dex3" else {"hands": self.scene.hands}),
         }
 
     def close(self) -> None:

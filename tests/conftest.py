@@ -148,6 +148,14 @@ def installed_falcon(tmp_path, monkeypatch):
     sys.modules.pop("falcon_tracker", None)
 
 
+@pytest.fixture
+def installed_homing(tmp_path, monkeypatch):
+    """The example package of a tracker with state estimation and a window, as an installer leaves it."""
+    monkeypatch.syspath_prepend(install(ROOT / "examples" / "new_tracker", tmp_path))
+    yield
+    sys.modules.pop("homing_tracker", None)
+
+
 @pytest.fixture(scope="session")
 def push_bin_site(tmp_path_factory):
     """Site packages with the example package of a task."""

@@ -44,7 +44,7 @@ INNER = {
         | checkpoint_packing families stored_flags teachable | network_compiler | policy_trainer | training_state
         | training_loop | training | training_check __main__""",
     f"{PACKAGE}.trackers": """interface motions | base | inference | front_end
-        | evaluation mjlab pd sonic tracker_check train twist2 | evaluate __main__""",
+        | evaluation mjlab pd sonic train twist2 | evaluate tracker_check __main__""",
     f"{PACKAGE}.trackers.train": """checkpoint curves model references train_options | export logger sampling simulation
         | terms | graphs tally | ppo tracker_env | runner | session | __main__""",
 }

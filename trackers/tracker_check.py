@@ -30,6 +30,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--checkpoint", default=None, metavar="PATH", help="its weights, where it comes without")
     add("--worlds", type=int, default=3, metavar="N", help="worlds in the larger batch (3)")
     add("--device", default="cpu", help="cpu, cuda or cuda:N (cpu)")
+    add("--stand", action="store_true", help="also stand and turn for two seconds in the lab: signs, frames, scales")
     return parser
 
 
@@ -48,6 +49,12 @@ def _check(argv: Sequence[str]) -> int:
     resolve_engine("warp", args.device)
     results = check_tracker(get(args.name, args.checkpoint), worlds=args.worlds, device=args.device, raises=False)
     print(table(f"tracker {args.name}", results))
+    if args.stand:
+        from arena_newton.trackers.evaluation.stand import stand
+
+        stood = stand(get(args.name, args.checkpoint), device=args.device)
+        print(table(f"tracker {args.name}, {len(stood)} measures of standing", stood))
+        results += stood
     return int(not all(result.ok for result in results))
 
 

@@ -15,19 +15,8 @@ from arena_newton.errors import InputError
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
 
-__all__ = [
-    "BUILT_IN",
-    "DYNAMICS",
-    "HELD_OUT",
-    "QUANTITIES",
-    "Mode",
-    "Quantity",
-    "check",
-    "get",
-    "names",
-    "register",
-    "unregister",
-]
+__all__ = ["BUILT_IN", "DYNAMICS", "HELD_OUT", "QUANTITIES", "Mode", "Quantity"]
+__all__ += ["get", "names", "register", "unregister"]
 
 DYNAMICS = "dynamics"
 """Record name of what a mode draws about an episode's dynamics, next to the names of the objects."""
@@ -93,6 +82,11 @@ class Mode:
                 raise InputError(f"mode {self.name}: {name}: {high:g}, expected at most {MOST_LATENCY} ticks")
 
     @property
+    def ruled(self) -> bool:
+        """True if the hash of a rule set holds all its ranges."""
+        return self.name in BUILT_IN and not self.dynamics
+
+    @property
     def looks(self) -> bool:
         """True if its pictures differ from those of base mode."""
         return self.scene != "base" or self.light is not None
@@ -107,45 +101,43 @@ class Mode:
 
     def hash_for(self, rules: RuleSet, tasks: Iterable[str]) -> str:
         """Hash of its ranges and of its scene's name, for some tasks under a rule set: 12 hex digits."""
-        ranges = [
-            [one.record, dataclasses.asdict(self.placements(one))]
-            for t in sorted(tasks)
-            for one in rules.task(t).objects
-        ]
+        objects = [one for task in sorted(tasks) for one in rules.task(task).objects]
+        ranges = [[one.record, dataclasses.asdict(self.placements(one))] for one in objects]
         light = None if self.light is None else dataclasses.asdict(self.light(rules))
         text = json.dumps([self.scene, ranges, light, sorted(self.dynamics.items())], separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 BUILT_IN = {
-    mode.name: mode
-    for mode in (
-        Mode(name="base", sentence="changes nothing"),
-        Mode(name="execution", sentence="objects start in wider ranges", placements=lambda rule: rule.execution),
-        Mode(name="semantic", sentence="textures, drawn shapes or decor differ", scene="semantic"),
-        Mode(name="semantic-2", sentence="a held-out look: others than those of semantic mode", scene="layer"),
-        Mode(name="semantic-3", sentence="another held-out look", scene="layer"),
-        Mode(
-            name="visual",
-            sentence="a distant light of drawn direction, intensity and colour",
-            light=lambda rules: rules.visual_light,
-        ),
-        Mode(
-            name=DYNAMICS,
-            sentence="friction, masses, gains and latencies differ, and the robot is pushed once",
-            dynamics={
-                "friction": (0.3, 1.2),
-                "robot_mass": (0.8, 1.2),
-                "object_mass": (0.5, 1.5),
-                "gains": (0.8, 1.2),
-                "state_latency": (0, 1),
-                "action_latency": (0, 1),
-                "push": (0.0, 1.0),
-                "push_heading": (-math.pi, math.pi),
-                "push_time": (0.02, 0.25),
-            },
-        ),
-    )
+    "base": Mode(name="base", sentence="changes nothing"),
+    "execution": Mode(
+        name="execution", sentence="objects start in wider ranges", placements=lambda rule: rule.execution
+    ),
+    "semantic": Mode(name="semantic", sentence="textures, drawn shapes or decor differ", scene="semantic"),
+    "semantic-2": Mode(
+        name="semantic-2", sentence="a held-out look: others than those of semantic mode", scene="layer"
+    ),
+    "semantic-3": Mode(name="semantic-3", sentence="another held-out look", scene="layer"),
+    "visual": Mode(
+        name="visual",
+        sentence="a distant light of drawn direction, intensity and colour",
+        light=lambda rules: rules.visual_light,
+    ),
+    DYNAMICS: Mode(
+        name=DYNAMICS,
+        sentence="friction, masses, gains and latencies differ, and the robot is pushed once",
+        dynamics={
+            "friction": (0.3, 1.2),
+            "robot_mass": (0.8, 1.2),
+            "object_mass": (0.5, 1.5),
+            "gains": (0.8, 1.2),
+            "state_latency": (0, 1),
+            "action_latency": (0, 1),
+            "push": (0.0, 1.0),
+            "push_heading": (-math.pi, math.pi),
+            "push_time": (0.02, 0.25),
+        },
+    ),
 }
 """The paper's four test modes, base, execution, semantic and visual; the held-out looks; and dynamics."""
 HELD_OUT = tuple(mode.name for mode in BUILT_IN.values() if mode.scene == "layer")
@@ -158,26 +150,15 @@ def names() -> tuple[str, ...]:
     return (*BUILT_IN, *(name for name in _MODES.names() if name not in BUILT_IN))
 
 
-def check(name: str) -> None:
-    """Refuse what is not the name of a mode.
-
-    Raises:
-        InputError: Unknown name; the message lists the known ones.
-    """
-    if name not in names():
-        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
-
-
 def get(name: str) -> Mode:
     """A mode by name.
 
     Raises:
-        InputError: Unknown mode, or a package that does not offer one.
+        InputError: Unknown name, or a package that offers something else.
     """
-    if name in BUILT_IN:
-        return BUILT_IN[name]
-    check(name)
-    mode = _MODES.make(name)
+    if name not in names():
+        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
+    mode = BUILT_IN.get(name) or _MODES.make(name)
     if mode.name != name:
         raise InputError(f"--mode {name}: its package calls it {mode.name}; entry point and record need one name")
     return mode

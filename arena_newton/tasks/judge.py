@@ -14,6 +14,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 from arena_newton.tasks.handles import BodyFrame, Marker
 
@@ -26,10 +27,9 @@ if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
     from arena_newton.rules.rule_types import RuleSet
 
-__all__ = ["PALMS", "Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
+__all__ = ["Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
 __all__ += ["origin", "palms", "slow", "standing", "top"]
 
-PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 _ABOVE = 50.0
 """Half extent of the box that represents everything above a height [m]: larger than any scene."""
 

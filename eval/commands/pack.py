@@ -231,9 +231,8 @@ def _in_order(cells: Sequence[CellResult], offered: Sequence[str], trackers: Seq
         return (known.index(name) if name in known else len(known)), name
 
     first = (*offered, *tasks.names())
-    return tuple(
-        sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, modes.names())))
-    )
+    order = modes.names()
+    return tuple(sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, order))))
 
 
 def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Sequence[str]) -> tuple[str, ...]:

@@ -87,7 +87,7 @@ def expand(
     if high > MAX_SEED:
         raise InputError(f"{seeds_flag} {_cut(high)}: expected at most {MAX_SEED}")
     for mode in modes:
-        all_modes.check(mode)
+        all_modes.get(mode)
     if repeats < 1:
         raise InputError(f"--repeats {repeats}: expected at least 1")
     if max_steps is not None and max_steps < 1:

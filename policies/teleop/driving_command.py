@@ -42,7 +42,7 @@ def make_world(options: SessionOptions) -> ArenaEnv:
     """
     if options.task not in tasks.names():
         raise InputError(f"--task {options.task}: unknown, choose from {', '.join(tasks.names())}")
-    modes.check(options.mode)
+    modes.get(options.mode)
     if not 0 <= options.seed <= LARGEST_SEED:
         raise InputError(f"--seed {options.seed}: expected 0 to {LARGEST_SEED}")
     variant = None

@@ -1,4 +1,4 @@
-"""A stranger's package brings a tracker with one class and an entry point: FALCON, whose weights are its own."""
+"""Packages bring trackers with one class and an entry point: FALCON, whose weights are its own; the example's."""
 
 import re
 from pathlib import Path
@@ -9,6 +9,10 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.errors import InputError
+from arena_newton.testing import check_tracker
+from arena_newton.trackers.evaluation.suite import Cell
+from arena_newton.trackers.evaluation.suite_rollout import make_plan, play
+from arena_newton.trackers.motions import primitives
 
 PACKAGE = Path(__file__).parent / "falcon_package"
 
@@ -73,3 +77,22 @@ def test_stands_and_walks(installed_falcon, weights):
     assert (qpos[:, 2] > 0.65).all(), f"fell: pelvis heights {qpos[:, 2]}"
     travelled = np.linalg.norm(qpos[:, :2] - start, axis=1)
     assert travelled[0] < 0.5 and 0.7 < travelled[1] < 2.2, travelled
+
+
+def test_example_with_needs_conforms(installed_homing):
+    """Installed, it is made by name and argument, keeps every promise and describes gain and window."""
+    tracker = trackers.get("homing:0.25")
+    assert all(result.ok for result in check_tracker(tracker))
+    described = trackers.get("homing:0.25").describe()
+    assert (described["gain"], described["lookahead"]) == (0.25, 2)
+    with pytest.raises(InputError, match="--tracker homing:fast: expected a gain in 1/s"):
+        trackers.get("homing:fast")
+
+
+def test_example_with_needs_drifts_less(installed_homing):
+    """State estimation pays: a walk ends nearer to its reference than TWIST2's, which sees no position."""
+    plan = make_plan([Cell("walk", "walk", 4.0, primitives.walk(0.5, seconds=4.0, pause=0.0))], 3, 0)
+    drift = {
+        name: play(trackers.get(name), plan, device="cpu").measures["drift"].mean() for name in ("twist2", "homing")
+    }
+    assert drift["homing"] < 0.7 * drift["twist2"], drift

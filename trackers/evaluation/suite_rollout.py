@@ -292,6 +292,8 @@ class SuiteRollout:
             torch.index_select(self.tables.actions[tick], 0, self._cell, out=loop.action)
             if self._goals is not None:
                 self._goals.write(self._pose(), loop.action)
+            if loop.lookahead:
+                loop.announce(self._coming(tick))
             if self._forces.any:
                 lab.force.copy_(self._forces.at(tick, self._pose()[:, 2]))
         targets = loop.tick(loop.action, self._every)
@@ -301,6 +303,13 @@ class SuiteRollout:
         live = self.meter.update(tick, reference, targets)
         if lab.engine == "mujoco":  # spare the CPU ended worlds; on CUDA the answer would wait for the device
             lab.physics.set_active(live.numpy())
+
+    def _coming(self, tick: int) -> torch.Tensor:
+        """Actions after a tick's, shape [worlds, n, 40]; NaN in the worlds of a goal, which decide tick by tick."""
+        coming = self.tables.actions[tick + 1 : tick + 1 + self.loop.lookahead].index_select(1, self._cell)
+        if self._goals is not None:
+            coming[:, self._goals.rows] = torch.nan
+        return coming.transpose(0, 1)
 
     def outcome(self) -> Outcome:
         """The measures; the one transfer from the device."""
