@@ -95,7 +95,7 @@ def reach(
     rows: int,
     tolerance: float = 0.25,
 ) -> Reach:
-    """How far an exact slope holds: whether differences at the scales of a decision contradict it.
+    """Differences at the scales of a decision beside an exact slope, which they may contradict.
 
     Through an impact a slope may be exact and mean nothing, because the outcome is a sawtooth of the moment of touch.
 

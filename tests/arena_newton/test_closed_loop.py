@@ -206,7 +206,7 @@ def test_what_has_no_gradient_is_refused(hall):
 
 
 def test_reach_tells_a_slope_that_holds_from_one_that_does_not():
-    """A slope that differences at one of two scales contradict is flagged: here a sawtooth on a trend, and the trend."""
+    """A slope that differences at one of two scales contradict is flagged, as of a sawtooth on a trend."""
 
     def sawtooth(points):
         return points[:, 0] + points[:, 1] - 5.0 * ((points[:, 1] / 4e-3) % 1.0 - 0.5) * 4e-3
