@@ -5,8 +5,9 @@
 
 from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state
 from arena_newton.differentiable.engine_step import EngineState, EngineStep
-from arena_newton.differentiable.estimates import Differences, Played, central_differences, play
+from arena_newton.differentiable.estimates import Differences, Played, Reach, central_differences, play, reach
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
+from arena_newton.differentiable.soft_onset import soft_onset
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "EngineState",
     "EngineStep",
     "Played",
+    "Reach",
     "ReferenceState",
     "Rolled",
     "RollingBall",
@@ -21,7 +23,9 @@ __all__ = [
     "central_differences",
     "closed_loop",
     "play",
+    "reach",
     "reference_step",
     "reset_state",
+    "soft_onset",
     "success_margin",
 ]
