@@ -262,11 +262,11 @@ class SonicFrontEnd(FrontEnd):
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
         self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, rows=worlds, width=8, device=self.device)
         self._rot6d = Quadratic(ROT6D, IDENTITY_6D, rows=worlds, device=self.device)
-        at = slices(self.variant.layout | PROPRIOCEPTION_LAYOUT)
+        at = slices({**self.variant.layout, **PROPRIOCEPTION_LAYOUT})
         if self.lookahead:
-            rows = {"rows": worlds * FRAMES, "device": self.device}
-            self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], width=8, **rows)
-            self._rot6ds = Quadratic(ROT6D, IDENTITY_6D, **rows)
+            rows = worlds * FRAMES
+            self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], rows=rows, width=8, device=self.device)
+            self._rot6ds = Quadratic(ROT6D, IDENTITY_6D, rows=rows, device=self.device)
             self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
 
         def frames(name: str) -> torch.Tensor:
