@@ -24,6 +24,7 @@ from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
 from arena_newton.kernels.rules import fall
 from arena_newton.physics.devices import resolve_engine
+from arena_newton.physics.dynamics import Delay, value_of
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
@@ -45,6 +46,9 @@ __all__ = ["STAND_ACTION", "ArenaEnv"]
 FALL_TRIGGERS = {fall.TILT: "tilt", fall.TILT_HELD: "tilt_held", fall.CONTACT: "contact"}
 """Trigger of the fall rule → its name in results."""
 
+NO_TICK = -(1 << 62)
+"""Tick of something that does not happen."""
+
 
 class ArenaEnv:
     """A batch of worlds; each runs an episode of its own."""
@@ -62,6 +66,7 @@ class ArenaEnv:
         variant_file: str | None = None,
         fast_physics: bool = False,
         drive: DriveGains | None = None,
+        hands: str = "dex3",
         camera: CameraConfig | None = None,
         cameras: Mapping[str, CameraConfig] | None = None,
         threads: int | None = None,
@@ -75,10 +80,11 @@ class ArenaEnv:
             engine: `auto`, `mujoco` or `warp`.
             device: Warp device, such as `cpu` or `cuda:0`.
             rules: Rule set or its name.
-            mode: One of `rule_types.MODES`.
+            mode: One of `modes.names()`.
             variant_file: A user's USD layer instead of the task's own scene.
             fast_physics: Use the tracker's fast physics rate.
             drive: Drive of the robot's joints instead of the one that tracker and rule set ask for.
+            hands: `dex3`, or `fixed`: hands without joints, for tasks without grasps.
             camera: Head camera for policies that see: the same as `cameras={"front": camera}`.
             cameras: Cameras for policies that see, by the names of their pictures (`CameraConfig.named`).
             threads: CPU threads of engine `mujoco`; all by default.
@@ -93,6 +99,7 @@ class ArenaEnv:
         if own_layer and variant_file:
             raise InputError(f"--variant {variant_file}: --mode {mode} has a scene of its own, choose one of the two")
         self.rules = rule_sets.get(rules) if isinstance(rules, str) else rules
+        variant = self.spec.variant(mode, self.rules)
         self.mode = mode
         """Mode of episodes whose own is not named."""
         self.modes = [mode] * worlds
@@ -110,7 +117,8 @@ class ArenaEnv:
             self.spec.name,
             worlds=self.worlds,
             device=device,
-            variant=None if variant_file and self.mode != "semantic" else self.spec.variant(self.mode, self.rules),
+            hands=hands,
+            variant=None if variant_file and variant == "base" else variant,
             rules=self.rules,
             drive=self.drive,
             variant_file=variant_file or own_layer,
@@ -135,6 +143,10 @@ class ArenaEnv:
         """Step budget of the rule set [ticks]."""
         self.draws: list[Draws | None] = [None] * self.worlds
         """Random numbers drawn for each world's episode."""
+        self._late: Delay | None = None
+        """Latency of the policy's state; None until a world has one."""
+        self._push_tick = np.full(self.worlds, NO_TICK)
+        """Tick before which each world is pushed."""
         self._anchored = np.zeros(self.worlds, dtype=bool)
         self._stand = torch.tensor(STAND_ACTION, device=self.torch_device)
         self._chosen, self._stepping = WorldMask(self.worlds, self.device), WorldMask(self.worlds, self.device)
@@ -189,6 +201,7 @@ class ArenaEnv:
             "startup_ticks": self.startup_ticks,
             "history": self.rules.startup.history,
             "tracker": self.tracker.describe(),
+            **({} if self.scene.hands == "dex3" else {"hands": self.scene.hands}),
         }
 
     def close(self) -> None:
@@ -271,6 +284,7 @@ class ArenaEnv:
                     qpos[k, address + 3 : address + 7] = placed.quat
             if self._lights is not None:
                 self._lights.set(world, draws.light)
+        self._set_dynamics(rows)
         p.reset_worlds(rows, qpos, mocap_pos, mocap_quat)
         mask = self._mask(rows)
         self.loop.fresh(mask, prefill=self.rules.startup.prefill)
@@ -282,6 +296,32 @@ class ArenaEnv:
         self.tick[rows] = -self.startup_ticks
         self.active[rows] = True
         self._anchored[rows] = False
+
+    def _set_dynamics(self, rows: np.ndarray) -> None:
+        """Give worlds the dynamics that were drawn for their episodes; without any, those of the scene."""
+        samples = [draws.dynamics if (draws := self.draws[world]) is not None else {} for world in rows.tolist()]
+        self.physics.set_dynamics(rows, samples)
+        self.loop.delay(rows, samples)
+        if self._late is None and any(samples):
+            self._late = Delay(self.worlds, STATE_WIDTH, self.torch_device)
+        for world, sample in zip(rows.tolist(), samples, strict=True):
+            if self._late is not None:
+                self._late.ticks[world] = int(value_of(sample, "state_latency"))
+            pushed = value_of(sample, "push") > 0.0
+            self._push_tick[world] = round(value_of(sample, "push_time") * self.budget) if pushed else NO_TICK
+
+    def _push(self, stepping: np.ndarray) -> None:
+        """Push the robots whose time has come."""
+        hit = stepping & (self.tick == self._push_tick)
+        if not hit.any():
+            return
+        change = np.zeros((self.worlds, 6), dtype=np.float32)
+        for world in np.flatnonzero(hit).tolist():
+            draws = self.draws[world]
+            assert draws is not None
+            heading = value_of(draws.dynamics, "push_heading")
+            change[world, :2] = value_of(draws.dynamics, "push") * np.array((np.cos(heading), np.sin(heading)))
+        self.physics.add_velocity(change, hit)
 
     def release(self, worlds: Sequence[int] | np.ndarray) -> None:
         """End the episodes of `worlds`: they stand still until their next reset."""
@@ -308,13 +348,14 @@ class ArenaEnv:
             image: Render the cameras too.
 
         Returns:
-            The observation; its state is a live view of the environment's buffer.
+            The observation; its state is a live view of the environment's buffer, or late by the episode's latency.
 
         Raises:
             InputError: A picture is asked for, but the environment has no camera.
         """
         self._anchor(self.active)
         self._observe()
+        state = self._state if self._late is None else self._late.late(self._state)
         images, depths = dict[str, torch.Tensor](), dict[str, torch.Tensor]()
         if image and not self.cameras:
             raise InputError("the policy needs images, but the environment was built without a camera")
@@ -323,7 +364,7 @@ class ArenaEnv:
             if self.camera_configs[name].depth:
                 depths[name] = camera.distance_picture().half()
         return Observation(
-            state=self._state,
+            state=state,
             image=images.get(FRONT),
             mask=self.active & (self.tick >= 0) if mask is None else mask,
             task=self.spec.name,
@@ -350,6 +391,8 @@ class ArenaEnv:
         chosen = self._chosen.choose(mask).warp
         self.loop.anchor(mask)
         self.judge.reset(chosen)
+        if self._late is not None:
+            self._late.forget(self._chosen.torch)
         kernels.launch_clear_log(self._log, chosen, 0)
         self.physics.lock_latch(chosen)
 
@@ -382,11 +425,20 @@ class ArenaEnv:
         starting = stepping & (self.tick < 0)
         if starting.any():
             self.loop.action[torch.from_numpy(starting).to(self.torch_device)] = self._stand
+        if self._late is not None:
+            self._observe()
+            self._late.keep(self._state, self._stepping.choose(stepping).torch)
         self.loop.tick(self.loop.action, stepping)
+        self._push(stepping)
         self.physics.set_active(stepping)
         self.physics.step()
+        return self.judge_tick(stepping)
+
+    def judge_tick(self, stepping: np.ndarray) -> np.ndarray:
+        """Judge what the physics has after a tick of some worlds, bool, shape [worlds]; codes as of `step`."""
+        starting = stepping & (self.tick < 0)
         self._stepping.choose(stepping)
-        if worlds is None or np.array_equal(stepping, self.active):
+        if (stepping == self.active).all():
             self.judge.evaluate(self.physics)
             self._rule()
         else:

@@ -331,6 +331,9 @@ class Physics(Protocol):
     def add_velocity(self, change: np.ndarray, mask: np.ndarray | None = None) -> None:
         """Add to the robot root's velocity: linear [m/s], world frame; angular [rad/s], body frame; [worlds, 6]."""
 
+    def set_dynamics(self, worlds: np.ndarray, samples: Sequence[Mapping[str, float]]) -> None:
+        """Give worlds the friction, masses and gains of samples of `modes.QUANTITIES`; an empty one, the scene's."""
+
     def set_active(self, mask: np.ndarray) -> None:
         """Worlds that `step` moves, bool, shape [worlds]; the others keep every bit of their state."""
 

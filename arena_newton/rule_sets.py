@@ -14,6 +14,7 @@ from arena_newton.cli.command_line import exit_code, program
 from arena_newton.cli.flags import parse_flags
 from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
+from arena_newton.rules.modes import BUILT_IN, DYNAMICS, QUANTITIES
 from arena_newton.rules.rule_types import (
     ByRules,
     CylinderRange,
@@ -34,14 +35,15 @@ def names() -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(ByRules))
 
 
-def get(name: str) -> RuleSet:
-    """A rule set by name.
+def get(name: str, played: Sequence[str] | None = None) -> RuleSet:
+    """A rule set by name, of all tasks, or of this package's and those that a run plays, whatever else is installed.
 
     Raises:
-        InputError: Unknown name.
+        InputError: Unknown name, or an unknown task that is played.
     """
     check_name(name)
-    return _assembled(name, tasks.specs())
+    known = tasks.specs() if played is None else map(tasks.get, dict.fromkeys((*tasks.OWN, *played)))
+    return _assembled(name, tuple(known))
 
 
 @functools.lru_cache(maxsize=4)
@@ -229,6 +231,10 @@ def markdown() -> str:
         for case in spec.overlaps
         for things in [" and ".join(path.removeprefix("/World/") for path in (case.first, case.second))]
     ]
+    drawn = [
+        (f"`{name}`", _span(bounds), QUANTITIES[name].unit, QUANTITIES[name].sentence)
+        for name, bounds in BUILT_IN[DYNAMICS].dynamics.items()
+    ]
     head = ("task", "things", "`--rules`", "`--mode`", "episodes of 60", "deepest [m]", "because")
     lines = [
         "# Rule sets",
@@ -238,6 +244,16 @@ def markdown() -> str:
         "This page is generated: `python -m arena_newton.rule_sets > docs/rules.md`.",
         "",
         *Table(("item", *(f"`{s.name}`" for s in sets)), items).compact(),
+        "",
+        "## Modes",
+        "",
+        "A mode changes base mode's episodes in what its line says, and in nothing else.",
+        "",
+        *Table(("`--mode`", "change"), [(f"`{mode.name}`", mode.sentence) for mode in BUILT_IN.values()]).compact(),
+        "",
+        "`dynamics` draws these once per episode, each by a generator of its own, under both rule sets:",
+        "",
+        *Table(("quantity", "range", "unit", "meaning"), drawn).compact(),
         "",
         "## Where both sets depart from the original",
         "",

@@ -12,7 +12,7 @@ Tasks, rules and episodes are unknown here, and the physics step is the caller's
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +24,7 @@ from arena_newton.interfaces import NEEDS, RobotState, TrackerCommand
 from arena_newton.kernels import canonical
 from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
+from arena_newton.physics.dynamics import Delay, value_of
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION_WIDTH, STAND_ACTION
 
@@ -120,7 +121,10 @@ class TrackerLoop:
             joint_pos=joints(),
             joint_vel=joints(),
         )
-        """Robot of the last tick, as the tracker got it; the root's numbers are live views of the physics."""
+        """Robot of the last tick, as a tracker gets it without latency; the root's numbers are live views of the
+        physics."""
+        self._late: tuple[Delay, Delay] | None = None
+        """Latencies of the tracker's state and of the joint targets; None until a world has one."""
         self.lookahead: int = getattr(tracker, "lookahead", 0)
         """Coming references that the tracker reads [ticks]."""
         self._give(getattr(tracker, "needs", ()))
@@ -193,6 +197,37 @@ class TrackerLoop:
         """
         self.tracker.reset(self._chosen.choose(mask).torch)
         self._prefill[mask] = prefill
+        for late in self._late or ():
+            late.forget(self._chosen.torch)
+
+    def delay(self, worlds: np.ndarray, samples: Sequence[Mapping[str, float]]) -> None:
+        """Give worlds the latencies of samples of the dynamics, at their reset before `fresh`.
+
+        The tracker gets the state as it was `state_latency` ticks ago, and its joint targets reach the actuators
+        `action_latency` ticks later; hands open and close at once.
+
+        Args:
+            worlds: World indices.
+            samples: Values of `modes.QUANTITIES`, one mapping per world.
+        """
+        if self._late is None:
+            if not any(samples):
+                return
+            width = sum(part.shape[1] for part in self.state.tensors().values())
+            self._late = Delay(self.worlds, width, self.torch_device), Delay(self.worlds, JOINTS, self.torch_device)
+        for late, name in zip(self._late, ("state_latency", "action_latency"), strict=True):
+            ticks = [int(value_of(sample, name)) for sample in samples]
+            late.ticks[torch.from_numpy(worlds).to(self.torch_device)] = torch.tensor(ticks, device=self.torch_device)
+
+    def _late_state(self, mask: torch.Tensor) -> RobotState:
+        """Robot as its latency lets the tracker see it."""
+        if self._late is None:
+            return self.state
+        parts = self.state.tensors()
+        now = torch.cat([*parts.values()], 1)
+        late = self._late[0].late(now).split([part.shape[1] for part in parts.values()], 1)
+        self._late[0].keep(now, mask)
+        return RobotState(**dict(zip(parts, late, strict=True)))
 
     def announce(self, coming: torch.Tensor) -> None:
         """Take the actions that follow the next tick's, for a tracker with a lookahead; they count for that tick alone.
@@ -257,6 +292,7 @@ class TrackerLoop:
         torch.index_select(self._qvel, 1, self._joint_qvel, out=state.joint_vel)
         if self.lookahead:
             self._look_ahead()
+        state = self._late_state(ticking)
         first = self._prefill & mask
         if first.any():
             self.tracker.prefill(command, state, self._chosen.choose(first).torch)
@@ -267,6 +303,10 @@ class TrackerLoop:
             self._take(self.tracker.step(command, state, ticking), ticking)
         else:
             self._take(self.tracker.step(command, state), ticking)
+        if self._late is not None:
+            targets = self._late[1].late(self.targets)
+            self._late[1].keep(self.targets, ticking)
+            torch.where(ticking[:, None], targets, self.targets, out=self.targets)
         self._drive()
         return self.targets
 

@@ -25,9 +25,9 @@ def action(tick: int) -> list[float]:
 def answer(asked: dict) -> dict:  # type: ignore[type-arg]
     """What is said to a request: who this is, that an episode may begin, or ten actions."""
     if asked["request"] == "config":
-        return {"arena": 1, "needs_picture": False, "policy": "squat by lines"}
+        return {"arena": 1, "needs_picture": False}
     if asked["request"] == "reset":
-        return {"seeded": True}  # an episode follows from its seed and observations, whoever else asks
+        return {"seeded": True, "policy": "squat by lines"}  # an episode follows from its own requests alone
     return {"action_chunk": [action(asked["step"] + tick) for tick in range(10)]}
 
 

@@ -1,7 +1,7 @@
 """Research on the runner: a push, and joint sensors with noise, in an ordinary run.
 
-Shows: `main(arguments, Factories(...))`, with which a program puts its parts into the commands of `eval`. What is random
-follows from an episode's seed; `describe` names it, so that no other program continues the run (docs/research.md).
+Shows: `main(arguments, Factories(...))`, with which a program puts its parts into the commands of `eval`. What is
+random follows from an episode's seed; `describe` names it, so that no other program continues the run.
 
     python examples/research.py --task boxing --policy learned --out research
 """
@@ -15,7 +15,7 @@ import torch
 
 from arena_newton import ArenaEnv
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.interfaces import Observation
 from arena_newton.robot.canonical import STATE
 

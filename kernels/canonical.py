@@ -39,13 +39,14 @@ __all__ = [
 ]
 
 JOINTS = wp.constant(29)
-STATE_VEL = wp.constant(35)
+"""Joints of the body, `g1.MUJOCO_JOINTS`, from which the widths follow."""
+STATE_VEL = wp.constant(6 + JOINTS)
 """First joint velocity of state 64."""
-ACTION_SIZE = wp.constant(40)
 ACTION_JOINTS = wp.constant(9)
 """First joint of action 40."""
-ACTION_HANDS = wp.constant(38)
+ACTION_HANDS = wp.constant(ACTION_JOINTS + JOINTS)
 """First hand of action 40."""
+ACTION_SIZE = wp.constant(ACTION_HANDS + 2)
 MIMIC_JOINTS = wp.constant(6)
 """First joint of mimic 35."""
 HAND_CLOSED_FROM = wp.constant(0.5)
@@ -116,13 +117,13 @@ class ReferencePose:
         return cls(
             position=zeros(worlds, 3),
             quat=zeros(worlds, 4),
-            joints=zeros(worlds, 29),
-            joint_vel=zeros(worlds, 29),
+            joints=zeros(worlds, JOINTS),
+            joint_vel=zeros(worlds, JOINTS),
             heading=zeros(worlds),
             prev_yaw=zeros(worlds),
             prev_z=zeros(worlds),
             hands=zeros(worlds, 2),
-            mimic=zeros(worlds, 35),
+            mimic=zeros(worlds, MIMIC_JOINTS + JOINTS),
             steps=wp.zeros(worlds, dtype=wp.int32, device=device),
             canonical_to_mujoco=wp.array(list(canonical_to_mujoco), dtype=wp.int32, device=device),
             tick=float(tick),

@@ -27,8 +27,8 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
+from arena_newton.robot.g1 import FEET
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind
-from arena_newton.trackers.evaluation.meter import FEET
 from arena_newton.trackers.evaluation.suite import Cell, clip_cells, tabulate
 from arena_newton.trackers.motions import primitives
 from arena_newton.tracking import TrackerLoop

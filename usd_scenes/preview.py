@@ -14,14 +14,14 @@ from arena_newton.errors import InputError
 from arena_newton.physics.scene import Scene, load_scene, scene_path
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.robot import g1
-from arena_newton.rules import rule_types
+from arena_newton.rules import modes as all_modes
 from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import draw_light
 from arena_newton.usd_scenes.shapes import open_stage
 
 __all__ = ["MODES", "preview"]
 
-MODES = tuple(mode for mode in rule_types.MODES if mode != "execution")
+MODES = tuple(mode.name for mode in all_modes.BUILT_IN.values() if mode.looks or mode.name == "base")
 """Modes that a scene looks different in; visual is the base variant under a drawn distant light."""
 _LIGHT_SEED = 0
 """Episode seed of the light drawn for visual mode."""
@@ -61,7 +61,7 @@ def preview(targets: list[str], out: Path, size: int = 320, *modes: str) -> Path
         (f"{target} | {name}", _views(target, height, name))
         for target in targets
         for name in shown
-        if "all" not in modes or target in tasks.names() or name not in rule_types.HELD_OUT
+        if "all" not in modes or target in tasks.names() or name not in all_modes.HELD_OUT
     ]
     widths = [round(height * aspect) for _, aspect in _VIEWS]
     area = (sum(widths) + _GAP * (len(widths) + 1), (height + _LABEL + _GAP) * len(rows))
@@ -100,7 +100,7 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
 
 def _variant(target: str, mode: str) -> str:
     """The variant of `semantics` to load: the one that the scene selects by itself, unless asked for semantic."""
-    if mode == "semantic" or mode in rule_types.HELD_OUT:
+    if mode == "semantic" or mode in all_modes.HELD_OUT:
         return mode
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")

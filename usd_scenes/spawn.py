@@ -10,7 +10,7 @@ from arena_newton import rule_sets, tasks
 from arena_newton.files import limits
 from arena_newton.physics.scene import Scene, load_scene, scene_path
 from arena_newton.robot import g1
-from arena_newton.rules.rule_types import HELD_OUT, MODES
+from arena_newton.rules import modes as all_modes
 from arena_newton.tasks import Draws, TaskSpec
 from arena_newton.usd_scenes.dependencies import Problem
 
@@ -50,8 +50,8 @@ def _pairs(path: str | Path, task: str) -> dict[tuple[str, str], tuple[float, li
     spec, rules = tasks.get(task), rule_sets.get("paper")
     scenes: dict[str | None, Scene] = {}
     found: dict[tuple[str, str], tuple[float, list[str]]] = {}
-    for mode in MODES:
-        if mode in HELD_OUT:  # a scene of its own
+    for mode, ranges in all_modes.BUILT_IN.items():
+        if ranges.scene == "layer" or ranges.dynamics:  # a scene of its own, or the placements of base mode
             continue
         # As in a run: a user's file keeps its own selection but in semantic mode.
         variant = spec.variant(mode, rules) if mode == "semantic" or str(path) == task else None

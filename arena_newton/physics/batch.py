@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -19,6 +19,7 @@ from arena_newton import interfaces
 from arena_newton.kernels import newton_state
 from arena_newton.kernels.rules import latch
 from arena_newton.physics.ball import set_restitution
+from arena_newton.physics.dynamics import varied
 from arena_newton.physics.scene import Scene
 
 if TYPE_CHECKING:
@@ -42,6 +43,9 @@ class Physics(interfaces.Physics, ABC):
         own = {id(model): _at_rate(model, scene, rate) for model in given}
         self._models = [own[id(model)] for model in given]
         self.worlds = scene.worlds
+        self._built = self._models * self.worlds if models is None else self._models
+        self._model_of = list(self._built)
+        """Model that each world steps: the one that it was built with, or one of other dynamics."""
         self.device: wp.Device = wp.get_device(scene.device)
         self.want_forces = False
         """Fill `contact_force` every tick (otherwise only in worlds tilted beyond 60°, engine `mujoco`)."""
@@ -63,7 +67,7 @@ class Physics(interfaces.Physics, ABC):
     @property
     def models(self) -> Sequence[mujoco.MjModel]:
         """One MuJoCo model for all worlds, or one per world, at this physics' rate; the scene's own stays as built."""
-        return tuple(self._models)
+        return tuple(self._models if self._model_of == self._built else self._model_of)
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -94,6 +98,20 @@ class Physics(interfaces.Physics, ABC):
             mocap_pos: Fixture positions [m], shape [k, nmocap, 3].
             mocap_quat: Fixture orientations wxyz, shape [k, nmocap, 4].
         """
+
+    def set_dynamics(self, worlds: np.ndarray, samples: Sequence[Mapping[str, float]]) -> None:
+        """See `interfaces.Physics.set_dynamics`."""
+        changed = []
+        for world, sample in zip(worlds.tolist(), samples, strict=True):
+            if sample or self._model_of[world] is not self._built[world]:
+                model = self._built[world]
+                self._model_of[world] = varied(model, self.scene.robot, sample) if sample else model
+                changed.append(world)
+        if changed:
+            self._use_models(changed)
+
+    def _use_models(self, worlds: Sequence[int]) -> None:  # noqa: B027 - an engine may read the models at each step
+        """Step these worlds by their models from now on."""
 
     def close(self) -> None:  # noqa: B027 - an engine without threads has nothing to release
         """See `interfaces.Physics.close`."""

@@ -51,7 +51,6 @@ class MujocoPhysics(Physics):
         mujoco.set_mju_user_warning(_ignore_warning)
         for model in self._models:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._model_of = self._models * self.worlds if models is None else self._models
         self._data = [mujoco.MjData(model) for model in self._model_of]
         m = scene.mj_model
         self._host: dict[str, np.ndarray] = {
@@ -151,6 +150,15 @@ class MujocoPhysics(Physics):
         d = self._data[world]
         d.qpos[:], d.qvel[:] = qpos, qvel
         self._publish(world, d)
+
+    def follow(self, data: Sequence[mujoco.MjData]) -> None:
+        """Take over what a tick has left of other copies of the worlds, one `MjData` each: state, contacts, latch."""
+        for w, given in enumerate(data):
+            mujoco.mj_copyData(self._data[w], self._model_of[w], given)
+            self._publish(w, self._data[w])
+            if self.scene.latch is not None:
+                self._host["latch"][w] = given.eq_active[self.scene.latch.equality]
+        self._read_contacts()
 
     def mj_step_only(self) -> None:
         """See `Physics.mj_step_only`."""

@@ -256,8 +256,10 @@ def _open_stage(path: Path, variant: str | None, hands: str) -> Usd.Stage:
     robot_prim = stage.GetPrimAtPath(ROBOT)
     if not robot_prim:
         raise InputError(f"{path}: prim {ROBOT} is missing")
-    if not robot_prim.GetVariantSet("hands").SetVariantSelection(hands):
-        raise InputError(f"{path}: prim {ROBOT} has no variant set 'hands'")
+    known_hands = robot_prim.GetVariantSet("hands").GetVariantNames()
+    if hands not in known_hands:
+        raise InputError(f"{path}: prim {ROBOT} has no hands {hands!r}, known are {' '.join(known_hands)}")
+    robot_prim.GetVariantSet("hands").SetVariantSelection(hands)
     world = stage.GetPrimAtPath("/World")
     sets = world.GetVariantSets()
     if variant is None:

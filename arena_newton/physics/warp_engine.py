@@ -28,6 +28,8 @@ PER_WORLD_FIELDS = (
     "body_invweight0",
     "dof_invweight0",
     "geom_friction",
+    "actuator_gainprm",
+    "actuator_biasprm",
 )
 """Fields of a MuJoCo model that may differ between worlds."""
 
@@ -46,7 +48,11 @@ class WarpPhysics(Physics):
         """Bind the solver's batch; see `physics.make_physics`."""
         super().__init__(scene, rate, models)
         self._m, self._d = _own_batch(scene, rate)
+        self._solver_graph: wp.Graph | None = None
+        self._tick_graph: wp.Graph | None = None
         d, m = self._d, scene.mj_model
+        self._fields: dict[str, np.ndarray] = {}
+        """`PER_WORLD_FIELDS` as they were built; empty until a world has dynamics of its own."""
         if models is not None:
             fields = {name: self._rows_of_models(name) for name in PER_WORLD_FIELDS}
             self._m = dataclasses.replace(self._m, **fields)
@@ -67,8 +73,6 @@ class WarpPhysics(Physics):
         arrays = [getattr(d, name) for name in _STATE] + [*published, self.latch_locked, self.overflow]
         self._state = [self._words(array) for array in arrays if array.size]
         self._before: list[wp.array] | None = None
-        self._solver_graph: wp.Graph | None = None
-        self._tick_graph: wp.Graph | None = None
         self._reset_all()
 
     def _floats(self, array: wp.array, *shape: int) -> wp.array:
@@ -87,6 +91,22 @@ class WarpPhysics(Physics):
         array = getattr(self._m, name)
         rows = np.stack([getattr(model, name) for model in self._models]).astype(np.float32)
         return wp.array(rows.reshape(array.numpy().shape), dtype=array.dtype, device=self.device)
+
+    def _use_models(self, worlds: Sequence[int]) -> None:
+        """Scale mujoco_warp's fields as the models were scaled; principal axes are not the same in both."""
+        if not self._fields:
+            own = {name: wp.clone(getattr(self._m, name)) for name in PER_WORLD_FIELDS}
+            self._m = dataclasses.replace(self._m, **own)
+            self._fields = {name: array.numpy().copy() for name, array in own.items()}
+            self._tick_graph = self._solver_graph = None
+        for name, built in self._fields.items():
+            rows = getattr(self._m, name).numpy()
+            for world in worlds:
+                now, was = (
+                    np.reshape(getattr(of[world], name), rows[world].shape) for of in (self._model_of, self._built)
+                )
+                rows[world] = built[world] * np.divide(now, was, out=np.ones_like(now), where=was != 0.0)
+            getattr(self._m, name).assign(rows)
 
     @property
     def external_force(self) -> wp.array:

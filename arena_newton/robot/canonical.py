@@ -3,6 +3,8 @@
 State and action hold their joints in canonical order, the mimic command in MuJoCo (TWIST2) order.
 """
 
+import itertools
+
 import numpy as np
 
 from arena_newton.errors import InputError
@@ -22,30 +24,26 @@ __all__ = [
     "validate_action",
 ]
 
-STATE: dict[str, slice] = {"root_rot6d": slice(0, 6), "joint_pos": slice(6, 35), "joint_vel": slice(35, 64)}
-"""State: root orientation without the episode's initial heading, joint positions [rad], joint velocities [rad/s]."""
-STATE_WIDTH = 64
 
-ACTION: dict[str, slice] = {
-    "root_xy_delta": slice(0, 2),
-    "root_z": slice(2, 3),
-    "root_rot6d": slice(3, 9),
-    "joint_pos": slice(9, 38),
-    "hands": slice(38, 40),
-}
+def _laid_out(**widths: int) -> dict[str, slice]:
+    """Parts of a vector by name, one behind the other."""
+    ends = list(itertools.accumulate(widths.values()))
+    return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
+
+
+_JOINTS = len(g1.MUJOCO_JOINTS)
+STATE: dict[str, slice] = _laid_out(root_rot6d=6, joint_pos=_JOINTS, joint_vel=_JOINTS)
+"""State: root orientation without the episode's initial heading, joint positions [rad], joint velocities [rad/s]."""
+STATE_WIDTH = STATE["joint_vel"].stop
+
+ACTION: dict[str, slice] = _laid_out(root_xy_delta=2, root_z=1, root_rot6d=6, joint_pos=_JOINTS, hands=2)
 """Action: reference root displacement [m/step, reference root frame], reference root height [m, world], reference root
 orientation without the episode's initial heading, reference joint positions [rad], left and right hand."""
-ACTION_WIDTH = 40
+ACTION_WIDTH = ACTION["hands"].stop
 
-MIMIC: dict[str, slice] = {
-    "velocity_xy": slice(0, 2),
-    "root_z": slice(2, 3),
-    "roll_pitch": slice(3, 5),
-    "yaw_rate": slice(5, 6),
-    "joint_pos": slice(6, 35),
-}
+MIMIC: dict[str, slice] = _laid_out(velocity_xy=2, root_z=1, roll_pitch=2, yaw_rate=1, joint_pos=_JOINTS)
 """Mimic command: velocity [m/s, reference root frame], height [m], roll, pitch, yaw rate [rad, rad/s], joints [rad]."""
-MIMIC_WIDTH = 35
+MIMIC_WIDTH = MIMIC["joint_pos"].stop
 
 IDENTITY_ROT6D: tuple[float, ...] = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 """Row layout: the first two columns of the rotation matrix, flattened row by row."""

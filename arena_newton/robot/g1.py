@@ -7,12 +7,14 @@ Vectors over the 29 body joints are in MuJoCo order unless the name says otherwi
 from dataclasses import asdict, dataclass
 
 __all__ = [
+    "ANKLES",
     "ARMS",
     "CANONICAL_JOINTS",
     "CANONICAL_TO_MUJOCO",
     "CRITICAL_BODY_WORDS",
     "DEFAULT_POSE",
     "DriveGains",
+    "FEET",
     "HAND_CLOSE_LEFT",
     "HAND_CLOSE_RIGHT",
     "HAND_JOINTS",
@@ -20,10 +22,12 @@ __all__ = [
     "LEGS",
     "MUJOCO_JOINTS",
     "MUJOCO_TO_CANONICAL",
+    "PALMS",
     "PhysicsRate",
     "SONIC_DRIVE",
     "SPAWN_HEIGHT",
     "TICK",
+    "TOE",
     "TWIST2_DRIVE",
     "TWIST2_HUMANOIDARENA_DRIVE",
     "WAIST",
@@ -51,15 +55,24 @@ LEGS: tuple[int, ...] = tuple(range(12))
 """Leg joints in MuJoCo order, left leg first."""
 WAIST: tuple[int, ...] = (12, 13, 14)
 """Waist joints in MuJoCo order: yaw, roll, pitch."""
-ARMS: tuple[int, ...] = tuple(range(15, 29))
+ARMS: tuple[int, ...] = tuple(range(15, len(MUJOCO_JOINTS)))
 """Arm joints in MuJoCo order, left arm first, wrists included."""
+
+PALMS = ("left_hand_palm_link", "right_hand_palm_link")
+"""Frames of the palms."""
+FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
+"""Links of the feet, whose origins are the ankles."""
+ANKLES = tuple(f"{side}_ankle_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll"))
+"""All links of the ankles."""
+TOE = (0.12, 0.0, -0.02)
+"""Front of a foot in its link [m]: the sole ends 0.14 m ahead of it."""
 
 CANONICAL_TO_MUJOCO: tuple[int, ...] = (
     0, 6, 12, 1, 7, 13, 2, 8, 14, 3, 9, 15, 22, 4, 10, 16, 23, 5, 11, 17, 24, 18, 25, 19, 26, 20, 27, 21, 28,
 )  # fmt: skip
 """`MUJOCO_JOINTS[CANONICAL_TO_MUJOCO[i]] == CANONICAL_JOINTS[i]`."""
 
-MUJOCO_TO_CANONICAL: tuple[int, ...] = tuple(CANONICAL_TO_MUJOCO.index(i) for i in range(29))
+MUJOCO_TO_CANONICAL: tuple[int, ...] = tuple(CANONICAL_TO_MUJOCO.index(i) for i in range(len(MUJOCO_JOINTS)))
 """`CANONICAL_JOINTS[MUJOCO_TO_CANONICAL[i]] == MUJOCO_JOINTS[i]`."""
 
 CANONICAL_JOINTS: tuple[str, ...] = tuple(MUJOCO_JOINTS[i] for i in CANONICAL_TO_MUJOCO)

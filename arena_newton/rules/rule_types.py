@@ -33,11 +33,6 @@ __all__ = [
 
 Range = tuple[float, float]
 
-HELD_OUT = ("semantic-2", "semantic-3")
-"""Modes whose looks are a layer of their own, `variants/<mode>.usda` next to a task's scene."""
-MODES = ("base", "execution", "semantic", *HELD_OUT, "visual")
-"""Test modes of the benchmark."""
-
 
 @dataclass(frozen=True)
 class PoseRange:

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 
 __all__ = ["DEMONSTRATION", "EVALUATION", "TELEOPERATION", "episode_seed", "light_rng", "object_rng", "object_seed"]
-__all__ += ["planned_seed", "policy_seed", "recording_seed", "seed_range"]
+__all__ += ["dynamics_rng", "planned_seed", "policy_seed", "recording_seed", "seed_range"]
 
 EVALUATION = "evaluation"
 """Range of the seeds that judge a policy, which are positive int32 as the original's: 0 to 2^31 - 1."""
@@ -97,3 +97,9 @@ def object_rng(object_seed: int, record_name: str) -> np.random.Generator:
 def light_rng(episode_seed: int) -> random.Random:
     """Generator of the light in visual mode."""
     return random.Random(int(episode_seed) ^ _LIGHT_KEY)
+
+
+def dynamics_rng(episode_seed: int, quantity: str) -> random.Random:
+    """Generator of one quantity of an episode's dynamics, by SHA-256 of its name and the episode seed."""
+    digest = hashlib.sha256(f"dynamics|{quantity}|{int(episode_seed)}".encode()).digest()
+    return random.Random(int.from_bytes(digest[:8], "big"))

@@ -16,10 +16,8 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
-from arena_newton.rules import seeding
+from arena_newton.rules import modes, seeding
 from arena_newton.rules.rule_types import (
-    HELD_OUT,
-    MODES,
     ByRules,
     CylinderRange,
     FixedLight,
@@ -130,6 +128,11 @@ class Draws:
     light: LightDraw | None
     """Distant light of the episode; None: the scene's dome."""
 
+    @property
+    def dynamics(self) -> Sample:
+        """Values of `modes.QUANTITIES` that differ from the usual; empty in a mode that draws none."""
+        return self.sampled.get(modes.DYNAMICS, {})
+
 
 @dataclass(frozen=True)
 class ObjectSpec:
@@ -217,7 +220,7 @@ def sample_pose(rng: np.random.Generator, ranges: PoseRange, order: tuple[str, .
 
 def object_range(rule: ObjectRule, mode: str) -> PoseRange | CylinderRange:
     """The range that applies in a mode."""
-    return rule.execution if mode == "execution" else rule.base
+    return modes.get(mode).placements(rule)
 
 
 def sample_objects(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
@@ -393,12 +396,11 @@ class TaskSpec:
 
     def variant(self, mode: str, rules: RuleSet) -> str:
         """Variant of the scene's set `semantics`."""
-        _check_mode(mode)
-        return rules.task(self.name).semantic_variant if mode == "semantic" else "base"
+        return rules.task(self.name).semantic_variant if modes.get(mode).scene == "semantic" else "base"
 
     def scene_name(self, mode: str, rules: RuleSet) -> str:
         """Name of the scene of a mode: modes of one name share it, and differ in placements and lights alone."""
-        return mode if mode in HELD_OUT else self.variant(mode, rules)
+        return mode if modes.get(mode).scene == "layer" else self.variant(mode, rules)
 
     def own_layer(self, mode: str) -> Path | None:
         """The layer that replaces the scene in this mode; None: the mode selects a `variant` of the scene.
@@ -406,37 +408,36 @@ class TaskSpec:
         Raises:
             InputError: The task has no such layer.
         """
-        if mode not in HELD_OUT:
+        if modes.get(mode).scene != "layer":
             return None
         path = self.layer.parent / "variants" / f"{mode}.usda"
         if not path.is_file():
             raise InputError(f"--mode {mode}: task {self.name} has no {path}")
         return path
 
+    def drawn(self, seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:
+        """Samples of the objects and, where the mode draws some, of the dynamics of the episode with this seed."""
+        dynamics = modes.get(mode).draw(seed)
+        return self.sample(seed, mode, rules) | ({modes.DYNAMICS: dynamics} if dynamics else {})
+
     def draw(self, seed: int, mode: str, rules: RuleSet, samples: Mapping[str, Sample] | None = None) -> Draws:
         """Everything random about the episode with this seed.
 
         Args:
             seed: Episode seed.
-            mode: One of `rule_types.MODES`.
+            mode: One of `modes.names()`.
             rules: Rule set; it decides where a sample is put.
             samples: Record name → sample, instead of those that the seed draws.
 
         Raises:
             InputError: Unknown mode.
         """
-        _check_mode(mode)
-        own = rules.task(self.name)
-        sampled = self.sample(seed, mode, own) if samples is None else dict(samples)
+        own, ranges = rules.task(self.name), modes.get(mode)
+        sampled = self.drawn(seed, mode, own) if samples is None else dict(samples)
         placed = {o.prim: world_pose(o, own.object(o.record), sampled[o.record]) for o in self.objects}
         light = None
-        if mode == "visual":
-            light = draw_light(seed, rules.visual_light)
+        if ranges.light is not None:
+            light = draw_light(seed, ranges.light(rules))
         elif own.light is not None:
             light = LightDraw(light_direction(0.0, 0.0, 0.0), own.light.intensity, own.light.color)
         return Draws(sampled, placed, light)
-
-
-def _check_mode(mode: str) -> None:
-    if mode not in MODES:
-        raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import ByRules, CylinderRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
@@ -20,13 +21,13 @@ from arena_newton.tasks.base import (
     object_range,
 )
 from arena_newton.tasks.interaction import Interaction
-from arena_newton.tasks.judge import PALMS, Judge, links, near, palms
+from arena_newton.tasks.judge import Judge, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics
     from arena_newton.physics.scene import Scene
 
-__all__ = ["PALMS", "TASK", "BoxingJudge", "BoxingRule"]
+__all__ = ["TASK", "BoxingJudge", "BoxingRule"]
 
 TARGET = "/World/Target"
 BOUNDS = f"{TARGET}/Frame/Bounds"

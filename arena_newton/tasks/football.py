@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import FEET, TOE
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import BodyFrame
@@ -21,10 +22,6 @@ __all__ = ["TASK", "FootballJudge", "FootballRule"]
 BALL = "/World/Ball"
 GOAL = "/World/Goal/Volume"
 PITCH = "/World/Pitch"
-FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
-
-TOE = (0.12, 0.0, -0.02)
-"""Front of a foot in its ankle link [m]: the sole ends 0.14 m ahead of it."""
 KICK = 0.06
 """Distance of a toe to the ball's bounding box [m] that counts as contact: half a foot's width, and some motion."""
 ROLLING = 0.5

@@ -14,6 +14,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.tasks.base import IDENTITY, SUCCESS
 from arena_newton.tasks.handles import BodyFrame, Marker
 
@@ -26,10 +27,9 @@ if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
     from arena_newton.rules.rule_types import RuleSet
 
-__all__ = ["PALMS", "Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
+__all__ = ["Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
 __all__ += ["origin", "palms", "slow", "standing", "top"]
 
-PALMS = ("left_hand_palm_link", "right_hand_palm_link")
 _ABOVE = 50.0
 """Half extent of the box that represents everything above a height [m]: larger than any scene."""
 
@@ -68,8 +68,8 @@ def slow(scene: Scene, prim: str, limit: float) -> Condition:
 
 def standing(scene: Scene, rules: RuleSet) -> tuple[Condition, ...]:
     """The robot stands, as a rule set says."""
-    pelvis = links(scene, "pelvis")
-    return above(*pelvis, rules.standing.min_root_z), Condition("upright", rules.standing.min_up, pelvis)
+    (pelvis,) = links(scene, "pelvis")
+    return above(pelvis, rules.standing.min_root_z), Condition("upright", rules.standing.min_up, (pelvis,))
 
 
 def origin(scene: Scene, prim: str) -> BodyFrame:
@@ -296,5 +296,14 @@ class ConditionsJudge(Judge):
         """See `Judge.decide`."""
         from arena_newton.kernels.rules.predicates import launch_conditions
 
-        state = physics.xpos, physics.xquat, physics.qpos, physics.qvel, physics.latch_locked
-        launch_conditions(*state, **self._success, ticks=self._ticks, counter=self._held, **self.outputs())
+        launch_conditions(
+            physics.xpos,
+            physics.xquat,
+            physics.qpos,
+            physics.qvel,
+            physics.latch_locked,
+            **self._success,
+            ticks=self._ticks,
+            counter=self._held,
+            **self.outputs(),
+        )

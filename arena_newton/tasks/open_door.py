@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.interaction import Interaction
-from arena_newton.tasks.judge import PALMS, Condition, Judge, bounding_box, links, near, palms
+from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, palms
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
-from arena_newton.robot.g1 import TICK
+from arena_newton.robot.g1 import PALMS, TICK
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
 from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import ROBOT, BodyFrame, Marker
 from arena_newton.tasks.interaction import Interaction
-from arena_newton.tasks.judge import PALMS, Condition, Judge, above, bounding_box, links, near, palms, top
+from arena_newton.tasks.judge import Condition, Judge, above, bounding_box, links, near, palms, top
 
 if TYPE_CHECKING:
     from arena_newton.physics.engines import Physics

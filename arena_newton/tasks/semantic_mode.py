@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from arena_newton import tasks
-from arena_newton.rules.rule_types import HELD_OUT
+from arena_newton.rules import modes
 
 __all__ = ["semantic_note", "semantic_notes", "task_title"]
 
@@ -20,17 +20,18 @@ def task_title(task: str) -> str:
     return {"pp_box": "P&PBox"}.get(task, "".join(word.capitalize() for word in task.split("_")))
 
 
-def semantic_notes(modes: Iterable[str]) -> list[str]:
+def semantic_notes(named: Iterable[str]) -> list[str]:
     """Notes next to every table of numbers of these modes; none where no mode is a semantic one."""
-    played = set(modes)
+    played = set(named)
     found = [semantic_note()] if "semantic" in played else []
-    if held := " and ".join(mode for mode in HELD_OUT if mode in played):
+    if held := " and ".join(mode for mode in modes.HELD_OUT if mode in played):
         found.append(
             f"{held}: held-out looks of this project, none of the paper's: other colours, textures, drawn shapes and "
             "decor than semantic mode, and other clutter in P&PBox; nothing else that moves or collides differs from "
             "base mode. They count as unseen for policies that were neither trained nor tuned on them."
         )
-    return found
+    others = [modes.get(name) for name in modes.names() if name in played]
+    return found + [f"{mode.name}: none of the paper's modes: {mode.sentence}." for mode in others if not mode.ruled]
 
 
 def semantic_note() -> str:

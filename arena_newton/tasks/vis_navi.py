@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import ANKLES
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
@@ -32,8 +33,6 @@ __all__ = ["TASK", "VisNaviJudge", "VisNaviRule"]
 
 SIGN = "/World/TargetSign"
 ZONE = f"{SIGN}/Frame/Zone"
-FEET = tuple(f"{side}_ankle_{axis}_link" for side in ("left", "right") for axis in ("pitch", "roll"))
-
 
 PREDICATES = (
     Predicate("approach", f"root within {num(REACH)} m of the marked area, seen from above"),
@@ -48,7 +47,7 @@ class VisNaviRule(SuccessRule):
 
     round_signs: bool
     """True if a zone that the stage marks as round (semantic mode's ring) is the disc in its box instead of the box."""
-    feet: tuple[str, ...] = FEET
+    feet: tuple[str, ...] = ANKLES
     """Links whose origins must be inside."""
 
     def sentence(self) -> str:
@@ -169,7 +168,7 @@ TASK = TaskSpec(
     predicates=PREDICATES,
     target=SIGN,
     # The area is entered by walking on: half a step (0.3 m) before its border the next one leads into it.
-    interaction=Interaction(ZONE, FEET, touch=0.0, stance=0.30, predicate="enter", level=True, reached_only=True),
+    interaction=Interaction(ZONE, ANKLES, touch=0.0, stance=0.30, predicate="enter", level=True, reached_only=True),
     without_legs=(
         "the rule asks for both ankle links inside the area's box and an upright robot; legs that hang still from a "
         "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"

@@ -114,7 +114,7 @@ class ArenaVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
             num_envs: Worlds in the batch.
             tracker: Name of the tracker that executes actions, or a tracker, which then belongs to this environment.
             checkpoint: Weights of a tracker that is given by name; those of the package when none is named.
-            mode: One of `rule_types.MODES`.
+            mode: One of `modes.names()`.
             rules: Rule set.
             engine: `auto`, `mujoco` or `warp`.
             device: Warp device, such as `cpu` or `cuda:0`.

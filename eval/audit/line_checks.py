@@ -46,7 +46,7 @@ def configuration_faults(run: RunRecord) -> Iterator[str]:
     if (
         is_current(run)
         and step_budgets(config)
-        and document["rule_set"] != dict(rule_sets.table(rule_sets.get(config["rules"])))
+        and document["rule_set"] != dict(rule_sets.table(rule_sets.get(config["rules"], config["task"])))
     ):
         yield f"{path}: rule_set is not what the rule set {config['rules']} of this hash says"
     if run.status is not None and run.status["state"] == "success" and not is_complete(run):

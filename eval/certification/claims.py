@@ -59,7 +59,8 @@ CLAIMS = (
     Claim("Policy and tracker know no more than they are given.", ("policy-inputs", "tracker-inputs")),
     Claim("Experts need their legs, but where a gliding base is known to do.", ("frozen-legs", "gliding-base")),
     Claim(
-        "Each axis of generalisation moves what its name says, and nothing else.", ("visual", "semantic", "execution")
+        "Each axis of generalisation moves what its name says, and nothing else.",
+        ("visual", "semantic", "execution", "dynamics"),
     ),
     Claim("Another tracker costs success although nothing else changes.", ("swap",)),
     Claim("The trackers' weights that come with the package are as good as the official ones.", ("official",)),

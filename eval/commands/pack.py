@@ -225,13 +225,14 @@ def _names(cell: EvaluatedCell | CellResult) -> tuple[str, str, str]:
 def _in_order(cells: Sequence[CellResult], offered: Sequence[str], trackers: Sequence[str]) -> tuple[CellResult, ...]:
     """Cells as a card lists them: tasks that it is offered for and trackers of its training come first."""
     from arena_newton import tasks
-    from arena_newton.rules.rule_types import MODES
+    from arena_newton.rules import modes
 
     def place(name: str, known: Sequence[str]) -> tuple[int, str]:
         return (known.index(name) if name in known else len(known)), name
 
     first = (*offered, *tasks.names())
-    return tuple(sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, MODES))))
+    order = modes.names()
+    return tuple(sorted(cells, key=lambda c: (place(c.task, first), place(c.tracker, trackers), place(c.mode, order))))
 
 
 def _solved(found: Sequence[CellResult], trained: Sequence[str], trackers: Sequence[str]) -> tuple[str, ...]:

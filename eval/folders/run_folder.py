@@ -231,7 +231,7 @@ class ResultsFolder:
         document: Document = {
             "config_hash": config.hash,
             "config": config.identity(),
-            "rule_set": dict(rule_sets.table(rule_sets.get(config.flags.rules))),
+            "rule_set": dict(rule_sets.table(rule_sets.get(config.flags.rules, config.flags.task))),
             "gym_ids": {name: tasks.get(name).gym_id for name in config.flags.task},
             "options": config.stored_flags(),
             "versions": self.installed,

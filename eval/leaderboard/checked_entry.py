@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,19 +13,22 @@ from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, Bo
 from arena_newton.eval.leaderboard.result_bundle import unpack
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.records.identity import hash_path
 from arena_newton.eval.tables.condition_rates import (
     ConditionRate,
     rate_of_cell,
     rates_of_paper,
     rates_of_published,
 )
-from arena_newton.eval.tables.episode_table import EvaluatedCell
+from arena_newton.eval.tables.episode_table import PlayedCell
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import FAMILIES, published
 from arena_newton.files.stored_json import shown
+from arena_newton.files.text import plain
+from arena_newton.trackers import shipped_weights
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["CheckedEntry", "check_entry"]
 
@@ -66,7 +69,7 @@ def check_entry(
     if at_hand:
         checked.faults += filter(None, [unpack(folder / BUNDLE_FILE, entry.bundle, into)])
         cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
-        checked.rates += map(rate_of_cell, cells)
+        checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
         weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
         if cells and entry.checkpoint != weights:
             checked.faults.append(f"{where}: checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}")
@@ -87,7 +90,7 @@ def check_entry(
 
 def _audit(
     checked: CheckedEntry, root: Path, replays: int, draw: int, factories: Factories | None
-) -> Sequence[EvaluatedCell]:
+) -> Sequence[PlayedCell]:
     """Audit every run of an unpacked bundle; its cells."""
     folders, suite = runs_in(root), (root / SUITE_FILE).exists()
     for folder in folders:
@@ -109,7 +112,17 @@ def _audit(
         return []
     cells = read_cells([root] if suite else folders)
     checked.faults += cells.changed
-    return [cell for cell in cells.cells if cell.latency == 0 and cell.records]
+    played = [cell for cell in cells.cells if isinstance(cell, PlayedCell)]
+    return [cell for cell in played if cell.latency == 0 and cell.records]
+
+
+def _unusual(cell: PlayedCell) -> str:
+    """Conditions of a cell that are not the protocol's, in words."""
+    drive = plain(cell.run.config.get("drive", "auto"))
+    found = [f"drive {drive}"] * (drive != "auto") + ["fast physics"] * bool(cell.run.config.get("fast_physics"))
+    weights, path = cell.records[0].hashes.get("checkpoint"), shipped_weights(cell.tracker)
+    other = weights is not None and (path is None or weights != hash_path(path))
+    return ", ".join(found + [f"other weights {plain(weights)}"] * other)
 
 
 def _counts(rates: Sequence[ConditionRate]) -> set[tuple[object, ...]]:

@@ -16,11 +16,13 @@ from arena_newton.eval.reports.failure_text import SENTENCES
 from arena_newton.eval.reports.html_report import FOLDER
 from arena_newton.eval.statistics.stats import contrast, suites, wilson
 from arena_newton.eval.tables.condition_rates import SETTINGS, ConditionRate
+from arena_newton.eval.tables.episode_table import NAMED
 from arena_newton.files.own_files import replace_atomically
 from arena_newton.files.stored_json import read_regular
+from arena_newton.files.text import plain
 from arena_newton.pages.html import FILES, render
 from arena_newton.pages.tables import between, percent
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules import modes
 from arena_newton.tasks.semantic_mode import semantic_notes, task_title
 
 __all__ = ["write_site"]
@@ -49,6 +51,8 @@ class _Row:
     mode: str
     trained_on: str
     tracker: str
+    unusual: str
+    """Conditions that are not the protocol's."""
     cells: tuple[_Cell, ...]
     """Mean over all tasks, then each task."""
     order: float
@@ -69,13 +73,13 @@ class _Section:
 
 def _rows(checked: CheckedEntry) -> Iterator[tuple[str, _Row]]:
     """Setting and row of every set of conditions of an entry."""
-    groups: dict[tuple[str, str, str, str], dict[str, ConditionRate]] = {}
+    groups: dict[tuple[str, ...], dict[str, ConditionRate]] = {}
     for rate in checked.rates:
-        groups.setdefault(rate.row, {})[rate.task] = rate
-    for (setting, mode, trained_on, tracker), rates in groups.items():
+        groups.setdefault((*rate.row, rate.unusual), {})[rate.task] = rate
+    for (setting, mode, trained_on, tracker, unusual), rates in groups.items():
         cells = [_cell(task_title(task), rates.get(task)) for task in suites()["ALL_AVG"]]
         mean = sum(rate.rate for rate in rates.values()) / len(rates)
-        yield setting, _Row(checked, mode, trained_on, tracker, (_mean(rates, mean), *cells), mean)
+        yield setting, _Row(checked, mode, trained_on, tracker, unusual, (_mean(rates, mean), *cells), mean)
 
 
 def _cell(label: str, rate: ConditionRate | None) -> _Cell:
@@ -128,7 +132,7 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
     filters = {
         "level": [level for level in LEVELS if any(row.level == level for row in shown)],
         "tracker": sorted({one for row in shown for one in row.tracker.split("+")}),
-        "mode": [mode for mode in MODES if any(row.mode == mode for row in shown)],
+        "mode": [mode for mode in modes.names() if any(row.mode == mode for row in shown)],
         "data": sorted({row.checked.entry.training_data for row in shown}),
     }
     columns = ("mean", *map(task_title, suites()["ALL_AVG"]))
@@ -177,6 +181,11 @@ def _facts(one: CheckedEntry) -> list[tuple[str, str]]:
     found += [("training", entry.training), ("training data", entry.training_data), ("weights", entry.checkpoint)]
     found += [("head", entry.head), ("bundle, SHA-256", entry.bundle), ("checked", entry.checked)]
     found += [("policy of its runs", " ".join(sorted({audit.run.config["policy"] for audit in audits})))]
+    for name in NAMED:
+        values = {plain(audit.run.config.get(name, "")) for audit in audits}
+        found += [(name.replace("_", " "), " ".join(sorted(values)))]
+    used = {(one.tracker, str(one.hashes.get("checkpoint"))) for audit in audits for one in audit.run.records}
+    found += [("weights of trackers", ", ".join(f"{tracker} {weights}" for tracker, weights in sorted(used)))]
     found += [("audit of this board", f"{played} episodes, {again} played again, no contradiction" * bool(audits))]
     return [(name, value) for name, value in found if value]
 

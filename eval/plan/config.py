@@ -40,6 +40,7 @@ from arena_newton.eval.records.identity import (
     foreign_task,
     hash_path,
     layers_hash,
+    mode_facts,
     own_code,
     scenes_hash,
 )
@@ -58,7 +59,7 @@ from arena_newton.pictures.settings import (
 from arena_newton.policies.base import DATASET_FILE, dataset_target, hub_name, is_privileged
 from arena_newton.policies.learned.learned_card import NOT_SHIPPED, PolicyCard, read_card, shipped_card
 from arena_newton.policies.remote.program import ProgramCommand
-from arena_newton.rules import seeding
+from arena_newton.rules import modes, seeding
 
 if TYPE_CHECKING:
     from arena_newton.policies.base import Policy
@@ -120,6 +121,8 @@ class RunConfig:
     """Built-in scenes of the run's tasks, by content."""
     code_hash: str
     """The package's own code that moves and judges, by content."""
+    mode_facts: Mapping[str, JsonObject] = dataclasses.field(default_factory=dict)
+    """Hashes of each mode whose ranges are not the rule set's."""
     foreign_tasks: Mapping[str, JsonObject] = dataclasses.field(default_factory=dict)
     """Hashes of scene and code of each task that another package brings; the built-in ones are hashed as a whole."""
     shard: Shard | None = None
@@ -169,6 +172,7 @@ class RunConfig:
             "code": self.code_hash,
             "tracker_facts": self.tracker_facts,
             "policy_facts": self.policy_facts,
+            **({"mode_facts": dict(self.mode_facts)} if self.mode_facts else {}),  # type: ignore[typeddict-item]
             **({"foreign_tasks": dict(self.foreign_tasks)} if self.foreign_tasks else {}),  # type: ignore[typeddict-item]
             **self._chunks(),
             **self._budget(),
@@ -354,6 +358,7 @@ def resolve(options: RunOptions) -> RunConfig:
         seed_range=seeding.EVALUATION if flags.series is None else seeding.DEMONSTRATION,
         most=flags.max,
     )
+    rule_set = rule_sets.get(options.rules)
     shard = None if options.shard is None else parse_shard(options.shard)
     if shard is not None and shard.count > len(episodes):
         raise InputError(f"--shard {shard}: the plan has {counted(len(episodes), 'episode')}, expected no more shards")
@@ -385,10 +390,11 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_options=policy_options,
         checkpoint_hashes=checkpoint_hashes,
         policy_hash=policy_hash,
-        rules_hash=rule_sets.get(options.rules).hash_for(tasks),
+        rules_hash=rule_set.hash_for(tasks),
         variant_hash=variant_hash,
         scenes_hash=scenes_hash(tasks, task_specs.names(), flags.mode),
         code_hash=code_hash(),
+        mode_facts={name: facts for name in flags.mode if (facts := mode_facts(name, rule_set, tasks))},
         foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
     )
 
@@ -447,9 +453,9 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
         raise InputError(f"{flag}looks {options.record_looks}: expected 0 to {MOST_LIGHTS}")
     if options.record_looks and "front" not in options.record_cameras:
         raise InputError(f"{flag}looks: are those of the camera front, which is not recorded")
-    if options.record_looks and (shown := {"semantic", "visual"} & {*options.mode}):
+    if options.record_looks and (shown := [mode for mode in options.mode if modes.get(mode).looks]):
         raise InputError(
-            f"{flag}looks: belongs to modes base and execution, not {min(shown)}: none must learn its looks"
+            f"{flag}looks: belongs to modes without looks of their own, not {min(shown)}: none must learn its looks"
         )
     found = {}
     for name in options.record_cameras:

@@ -11,8 +11,8 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED
 from arena_newton.files.stored_json import JsonObject
+from arena_newton.rules import modes as all_modes
 from arena_newton.rules import seeding
-from arena_newton.rules.rule_types import MODES
 
 __all__ = ["MAX_EPISODES", "PROTOCOL_REPEATS", "PROTOCOL_SEEDS", "Episode", "expand", "listed"]
 
@@ -87,8 +87,7 @@ def expand(
     if high > MAX_SEED:
         raise InputError(f"{seeds_flag} {_cut(high)}: expected at most {MAX_SEED}")
     for mode in modes:
-        if mode not in MODES:
-            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)}")
+        all_modes.get(mode)
     if repeats < 1:
         raise InputError(f"--repeats {repeats}: expected at least 1")
     if max_steps is not None and max_steps < 1:

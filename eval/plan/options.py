@@ -78,8 +78,8 @@ class Conditions:
     """Conditions under which tasks are done."""
 
     mode: Several[str] = ()
-    """Evaluation modes, one or several: base (when none is named) execution semantic visual, and the held-out looks
-    semantic-2 semantic-3. Modes with one scene (base execution visual) play in one batch of worlds."""
+    """Evaluation modes, one or several: base (when none is named) execution semantic visual, dynamics, and the held-out
+    looks semantic-2 semantic-3. Modes with one scene (base execution visual dynamics) play in one batch of worlds."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"

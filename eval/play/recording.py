@@ -23,7 +23,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.run_folder import EPISODES, comparable
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.records.identity import moving_versions, scenes_hash
+from arena_newton.eval.records.identity import mode_facts, moving_versions, scenes_hash
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
@@ -63,9 +63,11 @@ def facts_of(
         "checkpoint",
         "tracker_facts",
         "scenes",
+        "mode_facts",
         "foreign_tasks",
     )
     facts: JsonObject = {key: value for key, value in identity.items() if key not in left_out}
+    own = mode_facts(mode, rule_sets.get(flags.rules), (task,))
     return facts | {
         "checkpoint": config.checkpoint_hashes[tracker],
         "tracker_facts": (config.tracker_facts or {}).get(tracker),
@@ -73,6 +75,7 @@ def facts_of(
         "scenes": scenes_hash((task,), task_specs.names(), (mode,)),
         "environment": comparable(environment),
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
+        **({"mode_facts": own} if own else {}),
         **({"foreign_task": config.foreign_tasks[task]} if task in config.foreign_tasks else {}),
         **({"disturbance": noise.describe()} if (noise := disturbance_of(config, task, 1)) is not None else {}),
     }

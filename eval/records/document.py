@@ -91,6 +91,8 @@ class Identity(_Identity, total=False):
     drive: Name
     scenes: Annotated[str, Fit("a hash")]
     code: Annotated[str, Fit("a hash")]
+    mode_facts: Annotated[dict[Name, Facts], Fit("facts by mode")]
+    """Hashes of the modes whose ranges are not the rule set's; absent where there is none."""
     foreign_tasks: Annotated[dict[Name, Facts], Fit("facts by task")]
     """Hashes of the tasks that another package brings; absent where there is none."""
     tracker_facts: FactsOrNone

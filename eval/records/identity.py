@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import arena_newton
 from arena_newton.errors import InputError
-from arena_newton.rules.rule_types import HELD_OUT
+from arena_newton.rules import modes as all_modes
 
 if TYPE_CHECKING:
     from arena_newton.files.stored_json import JsonObject
+    from arena_newton.rules.rule_types import RuleSet
     from arena_newton.tasks import TaskSpec
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "hash_path",
     "hash_paths",
     "layers_hash",
+    "mode_facts",
     "moving_versions",
     "own_code",
     "package_files",
@@ -159,11 +161,13 @@ def package_files(root: Path) -> list[Path]:
 def code_files(root: Path = PACKAGE) -> list[Path]:
     """Modules of a package folder whose change may change a result: all but `UNHASHED` and command lines."""
 
-    def counts(file: Path) -> bool:
-        rooms = (part.as_posix() for part in file.relative_to(root).parents)
-        return file.suffix == ".py" and file.name != "__main__.py" and not any(room in UNHASHED for room in rooms)
+    @functools.cache
+    def counts(folder: Path) -> bool:
+        room = folder.relative_to(root)
+        return not any(part.as_posix() in UNHASHED for part in (room, *room.parents))
 
-    return [file for file in package_files(root) if counts(file)]
+    modules = (file for file in package_files(root) if file.suffix == ".py" and file.name != "__main__.py")
+    return [file for file in modules if counts(file.parent)]
 
 
 def code_hash(root: Path = PACKAGE) -> str:
@@ -183,7 +187,7 @@ def scene_files(root: Path, tasks: Collection[str], known: Collection[str], mode
     Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`, nor what is
     named after a held-out mode that is not among `modes`.
     """
-    others, unplayed = {"lab", *known} - set(tasks), set(HELD_OUT) - set(modes)
+    others, unplayed = {"lab", *known} - set(tasks), set(all_modes.HELD_OUT) - set(modes)
     scenes = root / "usd_scenes"
 
     def counts(file: Path) -> bool:
@@ -224,6 +228,15 @@ def foreign_task(spec: TaskSpec) -> JsonObject:
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
     return facts
+
+
+def mode_facts(name: str, rules: RuleSet, tasks: Collection[str]) -> JsonObject:
+    """Hashes of a mode's ranges for some tasks, and of the package of its functions, unless the rules hold them all."""
+    mode = all_modes.get(name)
+    if mode.ruled:
+        return {}
+    codes = {code for part in (mode.placements, mode.light) if part and (code := own_code(part)) is not None}
+    return {"ranges": mode.hash_for(rules, tasks)} | ({"code": config_hash(sorted(codes))} if codes else {})
 
 
 def own_code(part: object) -> str | None:

@@ -14,7 +14,7 @@ from typing import Annotated
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.files.stored_json import Fit, Json, JsonObject, Known, parse, read_regular, shown
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules import modes
 
 __all__ = ["MAX_CONFIG_BYTES", "MAX_COUNT", "MAX_EPISODES", "MAX_JOURNAL_BYTES", "MAX_SEED", "Count", "Mode"]
 __all__ += ["Positive", "Seed", "Task", "check_schema", "read_lines"]
@@ -29,7 +29,7 @@ MAX_EPISODES = 200_000
 """Episodes of one plan; the benchmark's largest has 1,680."""
 
 Task = Annotated[str, Known(tasks.names)]
-Mode = Annotated[str, Known(lambda: MODES)]
+Mode = Annotated[str, Known(modes.names)]
 Count = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_COUNT)]
 Positive = Annotated[int, Fit("a number of at least 1", lambda value: 1 <= value <= MAX_COUNT)]
 Seed = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_SEED)]

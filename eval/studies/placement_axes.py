@@ -1,4 +1,4 @@
-"""The ranges from which a task's placements are drawn, as axes: numbers that a study moves one by one."""
+"""The ranges from which placements and dynamics are drawn, as axes: numbers that a study moves one by one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from arena_newton.errors import InputError
+from arena_newton.rules import modes
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange, TaskRules
 from arena_newton.tasks.base import Sample, object_range
 
@@ -16,6 +17,7 @@ __all__ = ["Axis", "axes_of", "chosen", "moved"]
 POSE_KEYS = ("x", "y", "z", "yaw")
 CYLINDER_KEYS = ("azimuth", "z")
 UNITS = {"x": "m", "y": "m", "z": "m", "yaw": "rad", "azimuth": "rad", "bag": ""}
+UNITS |= {name: quantity.unit for name, quantity in modes.QUANTITIES.items()}
 """Unit of each number of a sample."""
 SAME_ANGLE = 1e-6
 """Difference of angles that rounding makes [rad]."""
@@ -23,12 +25,13 @@ SAME_ANGLE = 1e-6
 
 @dataclass(frozen=True)
 class Axis:
-    """One number of a placement and its range."""
+    """One number of a placement or of the dynamics, and its range."""
 
     record: str
-    """Object, by its name in the original's records."""
+    """Object, by its name in the original's records, or `dynamics`."""
     key: str
-    """`x`, `y`, `z` [m], `yaw`, `azimuth` [rad], or `bag`, the number of a cylinder from 1 on."""
+    """`x`, `y`, `z` [m], `yaw`, `azimuth` [rad], `bag`, the number of a cylinder from 1 on, or a quantity of the
+    dynamics."""
     low: float
     high: float
 
@@ -45,7 +48,7 @@ class Axis:
     @property
     def counts(self) -> bool:
         """True if its values are whole numbers."""
-        return self.key == "bag"
+        return self.key == "bag" or (self.record == modes.DYNAMICS and modes.QUANTITIES[self.key].whole)
 
     @property
     def turns(self) -> bool:
@@ -86,19 +89,25 @@ def axes_of(rules: TaskRules, mode: str) -> tuple[Axis, ...]:
             bounds = getattr(ranges, key)
             if bounds is not None and min(bounds) < max(bounds):
                 found.append(Axis(rule.record, key, min(bounds), max(bounds)))
-    return tuple(found)
+    return (*found, *dynamics_axes(mode))
+
+
+def dynamics_axes(mode: str) -> tuple[Axis, ...]:
+    """All numbers of the dynamics that are drawn in a mode."""
+    ranges = modes.get(mode).dynamics
+    return tuple(Axis(modes.DYNAMICS, name, low, high) for name, (low, high) in ranges.items() if low < high)
 
 
 def chosen(axes: Sequence[Axis], names: Sequence[str], task: str) -> tuple[Axis, ...]:
-    """The axes that a user named.
+    """The axes that a user named; also of the dynamics in a mode that draws none, where all else is then as usual.
 
     Raises:
         InputError: One is unknown or named twice.
     """
-    known = {axis.name: axis for axis in axes}
+    known = {axis.name: axis for axis in (*axes, *dynamics_axes(modes.DYNAMICS), *axes)}  # own ranges win
     for name in names:
         if name not in known:
-            raise InputError(f"--axes {name}: task {task} draws {', '.join(known) or 'nothing'}")
+            raise InputError(f"--axes {name}: task {task} draws {', '.join(known)}")
     if len(set(names)) < len(names):
         raise InputError(f"--axes {' '.join(names)}: each only once")
     return tuple(known[name] for name in names)
@@ -118,7 +127,7 @@ def moved(
     """
     found = {record: copy.copy(sample) for record, sample in sampled.items()}
     for axis, value in zip(axes, values, strict=True):
-        found[axis.record][axis.key] = int(value) if axis.counts else float(value)
+        found.setdefault(axis.record, {})[axis.key] = int(value) if axis.counts else float(value)
     for rule in rules.objects:
         _on_cylinder(rule, found[rule.record], mode)
     return found

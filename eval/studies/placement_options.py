@@ -23,11 +23,12 @@ class _Placements:
     checkpoint: str | None = None
     """Its weights; those that come with the package when none are named."""
     mode: str = "base"
-    """Mode whose ranges are searched: base, execution (wider), semantic, visual."""
+    """Mode whose ranges are searched: base, execution (wider), semantic, visual, dynamics."""
     rules: str = "paper"
     """Rule set: paper or released."""
     axes: Several[str] = ()
-    """Numbers that are moved, such as football.x football.y; the seeds draw the others. An unknown name lists all."""
+    """Numbers that are moved, such as football.x football.y, or dynamics.friction, also in a mode that leaves friction
+    alone; the seeds draw the others. An unknown name lists all."""
     seed: int = 0
     """Group seed of what is drawn; the same seeds are played at every placement."""
     repeats: int = 1

@@ -20,7 +20,8 @@ from arena_newton.eval.records.schema import MAX_COUNT
 from arena_newton.files.stored_json import MAX_TEXT, Json, JsonObject, check_types, shown
 from arena_newton.files.text import is_printable, plain_text
 from arena_newton.policies.chunk_flags import LABELS
-from arena_newton.rules.rule_types import MODES, check_name
+from arena_newton.rules import modes
+from arena_newton.rules.rule_types import check_name
 from arena_newton.trackers import check_spec
 
 __all__ = [
@@ -290,7 +291,7 @@ def _check_axes(where: str, axes: MatrixAxes | PolicyEntry, *, required: bool = 
             if list(values).count(value) > 1:
                 raise InputError(f"{where}: {key}: {value} is given twice")
     _check_names(f"{where}: tasks", axes.tasks, tasks.names())
-    _check_names(f"{where}: modes", axes.modes, MODES)
+    _check_names(f"{where}: modes", axes.modes, modes.names())
     for tracker in axes.trackers:
         _of(f"{where}: trackers", check_spec, tracker)
     for rules in axes.rules:

@@ -36,6 +36,8 @@ class ConditionRate:
     rate: float
     held: Mapping[Hashable, bool] | None
     """Success of each episode; None where even their number is not known."""
+    unusual: str = ""
+    """Conditions that are not the protocol's, such as `fast physics`; empty where there are none, or none is known."""
 
     @property
     def row(self) -> tuple[str, str, str, str]:

@@ -26,7 +26,7 @@ from arena_newton.eval.tables.episode_table import (
 )
 from arena_newton.files.stored_json import read_regular, shown
 from arena_newton.files.text import counted, plain_text
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules import modes
 
 __all__ = ["CellSet", "read_cells"]
 
@@ -129,7 +129,7 @@ def _of_row(
         falls = round(float(row.get("afr") or 0) * episodes)
     except (ValueError, OverflowError):
         falls = -1
-    if not 0 < episodes or not 0 <= won <= won + falls <= episodes or falls < 0 or mode not in MODES:
+    if not 0 < episodes or not 0 <= won <= won + falls <= episodes or falls < 0 or mode not in modes.names():
         raise InputError(f"{where}: episodes, successes, afr or mode are none of a cell")
     trained_on = tuple(plain_text(name, 80) for name in row["trained_on"].split("+"))
     merged = row["table"] == "merge_all"

@@ -23,7 +23,7 @@ from arena_newton.eval.tables.episode_table import (
 from arena_newton.eval.tables.table_entries import ordered
 from arena_newton.files.text import counted, plain
 from arena_newton.pages.tables import Table, between
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules.modes import names as mode_names
 from arena_newton.tasks.semantic_mode import semantic_notes
 
 __all__ = ["joint_table"]
@@ -45,7 +45,7 @@ def joint_table(runs: Sequence[RunRecord]) -> str:
     _check_unique(found)
     policies = list(dict.fromkeys(policy for policy, _ in found))
     used = dict.fromkeys(cell.tracker for _, cell in found)
-    modes = ordered({cell.mode for _, cell in found}, MODES)
+    modes = ordered({cell.mode for _, cell in found}, mode_names())
     cells: dict[tuple[str, ...], list[bool]] = {}
     for policy, cell in found:
         for task in (cell.task, ALL):

@@ -28,9 +28,10 @@ from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.planning import Floor, signed_distance
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, beyond, paced, passing
+from arena_newton.robot.g1 import PALMS
 from arena_newton.robot.rotations import atan2, rotate_xy, wrap_angle
 from arena_newton.tasks.base import ROOM
-from arena_newton.tasks.boxing import PALMS, TARGET
+from arena_newton.tasks.boxing import TARGET
 from arena_newton.trackers.motions.commands import MotionCommand
 from arena_newton.trackers.motions.kinematics import HAND_POINT
 from arena_newton.trackers.motions.navigate import NavigationLimits

@@ -30,6 +30,7 @@ from arena_newton.policies.experts.hands import WRISTS, Palms, Wrists
 from arena_newton.policies.experts.phases import Phases, select
 from arena_newton.policies.experts.style import Style
 from arena_newton.policies.experts.walking import Walk, along, passing
+from arena_newton.robot.g1 import FEET
 from arena_newton.robot.rotations import (
     atan2,
     heading,
@@ -216,7 +217,7 @@ class DoubleDeskExpert(Expert):
         _, centre, half = sight.box(f"{LEFT_DESK}/Top")
         self._left_edge = float(centre[1] - half[1])
         self._sill = float(sight.box(SILL)[1][1])
-        self._ankles = [sight.scene.link(f"{side}_ankle_roll_link") for side in ("left", "right")]
+        self._ankles = [sight.scene.link(name) for name in FEET]
         self._grasp_quat = torch.tensor(GRASP, device=device)
         self._palm_offset = torch.tensor(WRIST, device=device) + HAND_POINT * quat_apply(
             self._grasp_quat, torch.tensor([1.0, 0.0, 0.0], device=device)

@@ -233,8 +233,9 @@ class RemotePolicy(RemoteClient[bytes, _Reply]):
             raise RemoteError(f"{where}: the reply is not JSON") from error
         if status != 200 or (isinstance(content, dict) and "error" in content):
             message = content.get("error") if isinstance(content, dict) else None
-            text = f", {self.one_line(message)}" if isinstance(message, str) and message else ""
-            raise RemoteError(f"{where}: status {status}{text}", silent=silent, lost=episode_lost(text))
+            text = self.one_line(message) if isinstance(message, str) else ""
+            known = ", ".join(filter(None, [f"status {status}" if status != 200 or not text else "", text]))
+            raise RemoteError(f"{where}: {known}", silent=silent, lost=episode_lost(text))
         if not isinstance(content, dict):
             raise RemoteError(f"{where}: the reply is not a JSON object")
         return content

@@ -14,7 +14,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from PIL import Image
@@ -139,10 +139,14 @@ class ProcessPolicy(RemotePolicy):
     name = "process"
     reset_kind, infer_kind, described = " (reset)", " (infer)", "a policy program"
 
-    def __init__(self, command: str | None, **options: Any):
-        """Read the command, with `timeout` and `labels` of `RemoteClient`; nothing is started yet."""
+    def __init__(self, command: str | None, *, timeout: float = 60.0, labels: str = "v3.1"):
+        """Read the command, with `timeout` and `labels` as of `RemoteClient`; nothing is started yet.
+
+        Raises:
+            InputError: It is none, or its program is not found.
+        """
         self.command = ProgramCommand.read(command)
-        super().__init__(self.command.shown, retries=0, sequential=True, **options)
+        super().__init__(self.command.shown, retries=0, sequential=True, timeout=timeout, labels=labels)
         self._program = _Program(self.command)
         self._files: tempfile.TemporaryDirectory[str] | None = None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ class ProgramCommand:
             raise InputError(f"--policy process:{text}: {error}") from None
         if not words:
             raise InputError("--policy process: needs a command, as in 'process:python agent.py'")
-        files = [Path(word) for word in words if Path(word).is_file()]
+        files = [Path(word) for word in words if os.path.isfile(word)]
         absolute = tuple(str(Path(word).absolute()) if Path(word) in files else word for word in words)
         if shutil.which(absolute[0]) is None:
             raise InputError(f"--policy process:{text}: no program {words[0]} is found")

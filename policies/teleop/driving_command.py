@@ -23,8 +23,7 @@ from arena_newton.policies.teleop.source import Source
 from arena_newton.policies.teleop.teleop_options import BrowserOptions, SessionOptions
 from arena_newton.policies.teleop.teleop_session import TeleopSession
 from arena_newton.policies.teleop.world_view import PERIOD, WorldView
-from arena_newton.rules import seeding
-from arena_newton.rules.rule_types import MODES
+from arena_newton.rules import modes, seeding
 
 __all__ = ["drive", "drive_by_browser", "make_world", "session_facts"]
 
@@ -43,8 +42,7 @@ def make_world(options: SessionOptions) -> ArenaEnv:
     """
     if options.task not in tasks.names():
         raise InputError(f"--task {options.task}: unknown, choose from {', '.join(tasks.names())}")
-    if options.mode not in MODES:
-        raise InputError(f"--mode {options.mode}: unknown, choose from {', '.join(MODES)}")
+    modes.get(options.mode)
     if not 0 <= options.seed <= LARGEST_SEED:
         raise InputError(f"--seed {options.seed}: expected 0 to {LARGEST_SEED}")
     variant = None

@@ -15,7 +15,7 @@ class SessionOptions:
     """The world that a person drives in."""
 
     task: str = "football"
-    """Task: football double_desk pp_box open_door sit_sofa boxing vis_navi."""
+    """Task, the paper's or a package's: football double_desk pp_box open_door sit_sofa boxing vis_navi ..."""
     tracker: str = "twist2"
     """Tracker that executes the actions: twist2 sonic ..."""
     checkpoint: str | None = None

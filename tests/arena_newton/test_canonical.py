@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from arena_newton.errors import InputError
-from arena_newton.robot import canonical
+from arena_newton.kernels import canonical as kernels
+from arena_newton.robot import canonical, g1
 
 
 def neutral(*shape: int) -> np.ndarray:
@@ -16,17 +17,26 @@ def neutral(*shape: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("parts", "width"),
+    ("parts", "width", "protocol"),
     [
-        (canonical.STATE, canonical.STATE_WIDTH),
-        (canonical.ACTION, canonical.ACTION_WIDTH),
-        (canonical.MIMIC, canonical.MIMIC_WIDTH),
+        (canonical.STATE, canonical.STATE_WIDTH, 64),
+        (canonical.ACTION, canonical.ACTION_WIDTH, 40),
+        (canonical.MIMIC, canonical.MIMIC_WIDTH, 35),
     ],
 )
-def test_slices_tile_the_vector(parts, width):
-    """Slices follow each other without gap or overlap."""
+def test_slices_tile_the_vector(parts, width, protocol):
+    """Slices follow each other without gap or overlap; with the G1's joints the widths are those of the protocol."""
     covered = [i for part in parts.values() for i in range(part.start, part.stop)]
-    assert covered == list(range(width))
+    assert covered == list(range(width)) and width == protocol
+
+
+def test_kernels_know_the_same_joints():
+    """The kernels' joints and widths are those of the robot."""
+    assert len(g1.MUJOCO_JOINTS) == kernels.JOINTS and kernels.ACTION_SIZE == canonical.ACTION_WIDTH
+    assert kernels.STATE_VEL == canonical.STATE["joint_vel"].start
+    assert kernels.ACTION_JOINTS == canonical.ACTION["joint_pos"].start
+    assert kernels.ACTION_HANDS == canonical.ACTION["hands"].start
+    assert kernels.MIMIC_JOINTS == canonical.MIMIC["joint_pos"].start
 
 
 def test_a_valid_action_passes_unchanged():

@@ -132,6 +132,17 @@ def test_what_ran_is_described(env):
     assert said["tracker"]["name"] == "pd"
 
 
+def test_hands_can_be_chosen(env):
+    """Fixed hands have no joints and no actuators, and are named in results; the usual ones are not."""
+    fixed = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", hands="fixed")
+    fixed.reset([1])
+    assert fixed.step(np.tile(STAND_ACTION, (1, 1))).tolist() == [codes.RUNNING]
+    assert fixed.describe()["hands"] == "fixed" and "hands" not in env.describe()
+    assert env.physics.mj_model.nu - fixed.physics.mj_model.nu == 14
+    with pytest.raises(InputError, match=r"prim /World/Robot has no hands 'claws', known are dex3 fixed"):
+        ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", hands="claws")
+
+
 def test_a_drive_can_be_chosen():
     """A drive given by hand reaches the actuators; `released` takes the original's for a checkpoint that has one."""
     tracker = trackers.get("pd")

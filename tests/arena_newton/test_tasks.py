@@ -11,7 +11,8 @@ import pytest
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.rules import seeding
-from arena_newton.rules.rule_types import HELD_OUT, MODES, PoseRange
+from arena_newton.rules.modes import BUILT_IN, HELD_OUT
+from arena_newton.rules.rule_types import PoseRange
 from arena_newton.tasks.base import light_direction, widened
 from tests.scenes import scene
 
@@ -51,7 +52,7 @@ def test_samples_equal_the_recorded_ones(task, record, expected, rule_set, mode)
 
 
 @pytest.mark.parametrize("task", tasks.names())
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", BUILT_IN)
 @pytest.mark.parametrize("rule_set", [PAPER, RELEASED], ids=lambda r: r.name)
 def test_draws_are_pure_complete_and_in_range(task, mode, rule_set):
     """Two draws with one seed are equal, every object is placed, samples keep to their ranges."""
@@ -114,7 +115,7 @@ def test_released_placement_is_the_effective_one(task, prim, mode, x, y):
 def test_shelf_and_door_are_offsets_in_both_sets():
     """Shelf and door are placed alike by both rule sets."""
     for task in ("pp_box", "open_door"):
-        for mode in MODES:
+        for mode in BUILT_IN:
             assert draw(task, mode).placed == draw(task, mode, RELEASED).placed
 
 
@@ -235,7 +236,7 @@ def test_variants():
 def test_held_out_looks_are_layers_of_their_own():
     """A held-out mode selects a layer next to the scene, in each task of the package; a task without one says so."""
     for spec in map(tasks.get, tasks.PAPER):
-        assert all(spec.own_layer(mode) is None for mode in MODES if mode not in HELD_OUT)
+        assert all(spec.own_layer(mode) is None for mode in BUILT_IN if mode not in HELD_OUT)
         layers = [spec.own_layer(mode) for mode in HELD_OUT]
         assert [path.stem for path in layers] == list(HELD_OUT) and all(path.is_file() for path in layers)
         assert {spec.variant(mode, PAPER) for mode in HELD_OUT} == {"base"}

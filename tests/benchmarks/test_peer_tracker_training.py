@@ -102,7 +102,7 @@ def test_a_training_that_breaks_says_its_last_words(fake, motion, tmp_path):
 
 def test_a_training_that_hangs_is_ended(fake, motion, tmp_path, monkeypatch):
     """No answer in time is an error."""
-    mjlab = MjlabTraining(fake("import time; time.sleep(60)"), motion, 4, "cpu", tmp_path)
+    mjlab = MjlabTraining(fake("import time; time.sleep(600)"), motion, 4, "cpu", tmp_path)
     monkeypatch.setattr(peer_tracker_training, "ANSWER_S", 0.2)
     try:
         with pytest.raises(ArenaError, match="mjlab ended with code -9"):

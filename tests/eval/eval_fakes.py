@@ -15,8 +15,8 @@ import torch
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.play.run import Factories
-from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Verdict
+from arena_newton.eval.play.factories import Factories
+from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Recorder, Verdict
 from arena_newton.kernels import tick as codes
 from arena_newton.policies.base import Policy
 
@@ -155,6 +155,19 @@ class FakePolicy:
 
     def close(self):
         """Nothing to release."""
+
+
+class LastTick(Recorder):
+    """Gives each episode that does not fall its last tick as a metric."""
+
+    def finish(self, env, world, result):
+        if result.outcome != "fall":
+            result.extra["last_tick"] = float(env.tick[world])
+
+
+def last_tick(env):
+    """Recorders of an environment."""
+    return [LastTick()]
 
 
 def fake_tracker(spec, checkpoint):

@@ -14,7 +14,7 @@ from arena_newton.policies.experts.style import Style
 from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-from arena_newton.rules.rule_types import HELD_OUT
+from arena_newton.rules.modes import HELD_OUT
 from arena_newton.tasks.pp_box import BOX
 
 STILL = 6

@@ -13,12 +13,13 @@ from PIL import Image
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
 from arena_newton.robot import g1
+from arena_newton.robot.g1 import FEET
 from arena_newton.trackers.evaluate import main
 from arena_newton.trackers.evaluation import chart, tracker_film
 from arena_newton.trackers.evaluation.cells import QUICK, goals, suite
 from arena_newton.trackers.evaluation.figures import Result, figures
 from arena_newton.trackers.evaluation.lab import Lab, Start, WorldKind, variant
-from arena_newton.trackers.evaluation.meter import FEET, LINKS, Meter, TickReference
+from arena_newton.trackers.evaluation.meter import LINKS, Meter, TickReference
 from arena_newton.trackers.evaluation.suite import Cell, Navigation
 from arena_newton.trackers.evaluation.suite_rollout import Outcome, find_sill, make_plan, play
 from arena_newton.trackers.motions import primitives

@@ -11,7 +11,7 @@ import pytest
 from arena_newton import rule_sets, tasks
 from arena_newton.physics.scene import SCENES, load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
-from arena_newton.rules.rule_types import HELD_OUT
+from arena_newton.rules.modes import HELD_OUT
 from arena_newton.tasks.semantic_mode import semantic_note, task_title
 from tests.scenes import scene
 

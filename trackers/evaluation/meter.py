@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from arena_newton.robot import g1
+from arena_newton.robot.g1 import FEET
 from arena_newton.robot.rotations import heading, rotate_xy, wrap_angle
 from arena_newton.trackers.motions.kinematics import SOLE_HEIGHT
 
@@ -32,7 +33,6 @@ LINKS: tuple[str, ...] = tuple(
     for part in ("hip_roll", "knee", "ankle_roll", "shoulder_roll", "elbow", "wrist_yaw")
 ) + ("torso_link",)
 """Links whose position counts in the link error."""
-FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 CONTACT_HEIGHT = SOLE_HEIGHT + 0.01
 """An ankle frame below this counts as a foot on the floor [m]."""
 SEAT_LOAD = 100.0

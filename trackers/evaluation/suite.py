@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from arena_newton.robot.canonical import ACTION, ACTION_WIDTH, STAND_ACTION
-from arena_newton.robot.g1 import TICK
+from arena_newton.robot.g1 import FEET, TICK
 from arena_newton.robot.rotations import heading, quat_apply, quat_from_yaw
-from arena_newton.trackers.evaluation.meter import FEET, LINKS
+from arena_newton.trackers.evaluation.meter import LINKS
 from arena_newton.trackers.motions.formats import read_library
 from arena_newton.trackers.motions.frames import actions_to_motion, motion_actions
 from arena_newton.trackers.motions.generator import ReferenceGenerator

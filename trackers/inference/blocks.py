@@ -13,10 +13,10 @@ divided among threads, each with a product of its own. On other devices the batc
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import itertools
+import threading
 import warnings
 import weakref
 import zlib
@@ -58,12 +58,20 @@ class OnnxProduct:
     """A network in ONNX Runtime: rows in, rows out."""
 
     def __init__(self, graph: bytes, threads: int = 1):
-        """Make one of a file with one input, `obs`, and one output, `action`, on some threads."""
-        self._session = onnxruntime.InferenceSession(
-            graph, session_options(threads), providers=["CPUExecutionProvider"]
-        )
+        """Take a file with one input, `obs`, and one output, `action`; its session begins when it is first needed."""
         self._graph, self._threads = graph, threads
         self._others: dict[int, OnnxProduct] = {}
+        self._begun: onnxruntime.InferenceSession | None = None
+        self._beginning = threading.Lock()
+
+    @property
+    def _session(self) -> onnxruntime.InferenceSession:
+        with self._beginning:
+            if self._begun is None:
+                self._begun = onnxruntime.InferenceSession(
+                    self._graph, session_options(self._threads), providers=["CPUExecutionProvider"]
+                )
+            return self._begun
 
     def on(self, threads: int) -> OnnxProduct:
         """The network on a number of threads, which changes no bit; each number holds the weights once more."""
@@ -95,6 +103,8 @@ class OnnxProduct:
 def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-4, atol: float = 1e-5) -> OnnxProduct:
     """The network in ONNX Runtime, on one thread of the CPU; its graph is stored in the kernel cache.
 
+    A graph is compared with torch before it is stored, by the libraries and processor's instructions in its name.
+
     Args:
         network: Maps a tensor to a tensor, rows first.
         shape: Of an input; any number of rows may be given later.
@@ -104,21 +114,15 @@ def compiled(network: torch.nn.Module, shape: tuple[int, ...], rtol: float = 1e-
     Raises:
         InputError: It cannot be exported, or ONNX Runtime computes something else.
     """
-    probe = torch.randn(shape, generator=torch.Generator().manual_seed(8))
     path = graph_file(network.eval(), shape)
-
-    def checked(graph: bytes) -> OnnxProduct:
+    if (known := read_graph(path)) is not None:
+        return OnnxProduct(known)
+    probe = torch.randn(shape, generator=torch.Generator().manual_seed(8))
+    try:
+        graph = _exported_graph(network, probe)
         run = OnnxProduct(graph)
         with torch.no_grad():
             torch.testing.assert_close(run(probe), network(probe), rtol=rtol, atol=atol)
-        return run
-
-    if (known := read_graph(path)) is not None:
-        with contextlib.suppress(Exception):
-            return checked(known)
-    try:
-        graph = _exported_graph(network, probe)
-        run = checked(graph)
     except Exception as error:  # exporter and runtime raise classes of their own
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"the network cannot run in ONNX Runtime ({type(error).__name__}: {reason})") from error

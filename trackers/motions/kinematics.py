@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS
+from arena_newton.robot.g1 import DEFAULT_POSE, FEET, MUJOCO_JOINTS
 from arena_newton.robot.rotations import matrix_from_quat_np, quat_apply, quat_multiply
 from arena_newton.usd_scenes.g1.links import LINKS
 
@@ -152,7 +152,7 @@ def neutral_stance() -> Stance:
         torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64),
         torch.tensor(DEFAULT_POSE, dtype=torch.float64),
     )
-    feet = poses.position[[link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]]
+    feet = poses.position[[link_index(name) for name in FEET]]
     wrist = [link_index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
     palm = torch.tensor([HAND_POINT, 0.0, 0.0], dtype=torch.float64).expand(2, 3)
     hands = poses.position[wrist] + quat_apply(poses.quat[wrist], palm)

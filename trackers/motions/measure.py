@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arena_newton.robot.g1 import MUJOCO_JOINTS, TICK
+from arena_newton.robot.g1 import FEET, MUJOCO_JOINTS, TICK
 from arena_newton.robot.rotations import quat_apply
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.motions.library import SUPPORTS, MotionLibrary
@@ -67,7 +67,7 @@ class ClipMeasures:
 
 def _soles(library: MotionLibrary) -> np.ndarray:
     """Middles of both soles [m], shape [frames, 2, 3]."""
-    feet = [kinematics.link_index(f"{side}_ankle_roll_link") for side in ("left", "right")]
+    feet = [kinematics.link_index(name) for name in FEET]
     out = np.empty((library.frames, 2, 3), dtype=np.float32)
     for first in range(0, library.frames, 20000):
         part = slice(first, first + 20000)

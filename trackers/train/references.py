@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from arena_newton.robot import rotations
+from arena_newton.robot import g1, rotations
 from arena_newton.trackers.motions import kinematics
 
 if TYPE_CHECKING:
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["FEET", "KEY_LINKS", "Frame", "ReferenceBank"]
 
 KEY_LINKS: tuple[str, ...] = (
-    "left_ankle_roll_link",
-    "right_ankle_roll_link",
+    *g1.FEET,
     "left_knee_link",
     "right_knee_link",
     "torso_link",

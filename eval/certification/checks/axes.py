@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from PIL import Image
 
@@ -20,7 +22,10 @@ from arena_newton.files.stored_json import JsonObject
 from arena_newton.interfaces import World
 from arena_newton.pages.tables import Table
 from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import STAND_ACTION
+from arena_newton.rules import modes
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange
+from arena_newton.tasks.handles import RobotHandles
 
 __all__ = ["CHECKS", "allowed_difference", "moved_coordinates", "named_coordinates"]
 
@@ -34,6 +39,14 @@ FILLED = 0.9
 """Fraction of a range that the draws of `DRAWN_SEEDS` episodes must span: they do with all but 1e-20 probability."""
 RESET_WORLDS = 4
 """Episodes whose worlds are compared after the reset."""
+STOOD_TICKS = 60
+"""Length of the episodes of a standing robot whose dynamics are compared [ticks], start-up not counted."""
+PUSHED_AT = 20
+"""Tick of their push."""
+DERIVED = "body_subtreemass body_invweight0 dof_invweight0 dof_M0 actuator_acc0".split()
+"""Fields of a model that follow from masses."""
+SCALED = 1e-12
+"""Relative error of a scaled field: rounding."""
 SEMANTIC_LOSS = (3, 60)
 """Successes, of so many episodes, by which semantic mode may differ."""
 
@@ -253,9 +266,90 @@ def _poses(env: World) -> dict[str, bytes]:
     return {path: position[:, body].tobytes() + quat[:, body].tobytes() for path, body in env.scene.body_ids.items()}
 
 
+def dynamics(context: Context) -> CheckFinding:
+    """Compare draws with the ranges, compiled models with the draws, and a robot that stands with one in base mode."""
+    if context.options.engine != "mujoco":
+        return skipped("bits are promised on engine mujoco alone")
+    rows, broken, name = [], [], modes.DYNAMICS
+    ranges, first = modes.get(name).dynamics, context.tasks[0]
+    for key, bounds in ranges.items():
+        drawn = [modes.get(name).draw(seed)[key] for seed in context.seeds(first, DRAWN_SEEDS)]
+        rows.append((key, modes.QUANTITIES[key].unit, _range(bounds), f"{min(drawn):.3f} … {max(drawn):.3f}"))
+        if not _fills(min(drawn), max(drawn), bounds):
+            broken.append(f"{key}: drawn from {min(drawn):.3f} to {max(drawn):.3f}, not {_range(bounds)}")
+    for task in context.tasks:
+        spec, rule_set = tasks.get(task), rule_sets.get("paper")
+        for seed in context.seeds(task, DRAWN_SEEDS):
+            base, other = spec.draw(seed, "base", rule_set), spec.draw(seed, name, rule_set)
+            if (base.placed, base.light) != (other.placed, other.light):
+                broken.append(f"{task}: episode seed {seed} has other placements or lights than in base mode")
+                break
+        found = context.measured(
+            name, task, context.trackers[0], {}, functools.partial(_stand, context, task, context.trackers[0])
+        )
+        broken += [f"{task}: {fault}" for fault in found]
+    sheet = Table(("quantity", "unit", "range", f"drawn in {DRAWN_SEEDS} episodes"), rows, title="What the mode draws")
+    summary = f"{len(rows)} quantities are drawn and act; with usual values every bit is that of base mode"
+    return CheckFinding(
+        "fail" if broken else "pass", f"{len(broken)} deviations" if broken else summary, (sheet,), tuple(broken)
+    )
+
+
+def _stand(context: Context, task: str, tracker: str) -> list[str]:
+    """Faults of an episode in which the robot stands: in base mode, with usual values, with each quantity alone."""
+    ranges = modes.get(modes.DYNAMICS).dynamics
+    alone = [key for key in ranges if key not in ("push_heading", "push_time")]
+    env = world_of(context, task, tracker, worlds=2 + len(alone))
+    drawn = tasks.get(task).drawn(context.seeds(task, 1)[0], "base", env.rules.task(task))
+    usual = {key: quantity.usual for key, quantity in modes.QUANTITIES.items()}
+    usual["push_time"] = PUSHED_AT / env.budget
+    given = [{}, usual, *({**usual, key: ranges[key][1]} for key in alone)]
+    faults = []
+    built = env.physics.mj_model
+    seeds = context.seeds(task, 1) * env.worlds
+    env.reset(seeds, samples=[drawn | ({modes.DYNAMICS: sample} if sample else {}) for sample in given])
+    for sample, model in zip(given, env.physics.models, strict=True):
+        faults += [f"{field} is not as drawn" for field in _strays(built, model, env.scene.robot, usual | sample)]
+    states = []
+    for _ in range(env.startup_ticks + STOOD_TICKS):
+        env.step(np.tile(np.asarray(STAND_ACTION, dtype=np.float32), (env.worlds, 1)))
+        states.append([env.physics.qpos.numpy()[world].tobytes() for world in range(env.worlds)])
+    env.close()
+    base, plain, *others = zip(*states, strict=True)
+    if base != plain:
+        faults.append(f"usual values differ from base mode from tick {first_difference(base, plain)} on")
+    for key, trace in zip(alone, others, strict=True):
+        tick = first_difference(base, trace)
+        still = key == "object_mass"  # where no object moves, its mass changes nothing
+        if (tick is None and not still) or (key == "push" and tick != env.startup_ticks + PUSHED_AT):
+            faults.append(f"{key} acts from tick {tick} on")
+    return faults
+
+
+def _strays(
+    built: mujoco.MjModel, model: mujoco.MjModel, robot: RobotHandles, sample: Mapping[str, float]
+) -> list[str]:
+    """Fields of a model that are not those of the built one, scaled as a sample says."""
+    wanted = copy.copy(built)
+    mass = np.full(built.nbody, sample["object_mass"])
+    mass[list(robot.bodies)] = sample["robot_mass"]
+    wanted.body_mass *= mass
+    wanted.body_inertia *= mass[:, None]
+    wanted.geom_friction[:, 0] *= sample["friction"]
+    wanted.actuator_gainprm[robot.joint_ctrl, 0] *= sample["gains"]
+    wanted.actuator_biasprm[robot.joint_ctrl, 1:3] *= sample["gains"]
+    fields = {name: value for name in dir(wanted) if isinstance(value := getattr(wanted, name), np.ndarray)}
+    return [
+        name
+        for name, value in fields.items()
+        if name not in DERIVED and not np.allclose(getattr(model, name), value, rtol=SCALED, atol=0.0)
+    ]
+
+
 CHECKS = (
     Check("visual", "Does visual mode leave every bit of the physics as it is, and change the picture?", visual),
     Check("semantic", "Do semantic variants leave the experts' success within 3 of 60?", semantic),
     Check("execution", "Does execution mode move the placements that the rules name, and nothing else?", execution),
+    Check("dynamics", "Does dynamics mode change what it draws, and nothing else?", dynamics),
 )
 """This module's checks."""

@@ -22,6 +22,7 @@ from arena_newton.physics.devices import resolve_engine
 from arena_newton.physics.engines import make_physics
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import STAND_ACTION
+from arena_newton.robot.g1 import FEET
 from arena_newton.usd_scenes.g1.links import LINKS
 
 if TYPE_CHECKING:
@@ -329,7 +330,7 @@ def soles(bench: Bench) -> Iterator[Measurement]:
     wrenches = {scene.link(link.name): np.zeros(6) for link in LINKS}
     for link in LINKS:
         wrenches[scene.link(link.name)][[0, 2]] = 0.0, link.mass * GRAVITY
-    feet = [scene.link(f"{side}_ankle_roll_link") for side in ("left", "right")]
+    feet = [scene.link(name) for name in FEET]
     for foot in feet:
         wrenches[foot][2] -= 0.5 * MASS * GRAVITY
     bench.start(qpos)

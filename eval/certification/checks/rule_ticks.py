@@ -19,6 +19,7 @@ from arena_newton.eval.certification.context import Context
 from arena_newton.eval.certification.finding import Check, CheckFinding, skipped
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pages.tables import Table
+from arena_newton.robot.g1 import FEET, PALMS
 from arena_newton.rollout import Rollout
 from arena_newton.tasks import boxing, double_desk, football, open_door, pp_box, vis_navi
 
@@ -116,13 +117,13 @@ def _sit_sofa(s: _State) -> bool:
 def _boxing(s: _State) -> bool:
     target = s.scene.marker(boxing.BOUNDS)
     reach = max(target.half) + 0.08
-    palms = [s.placed(s.scene.frame(name))[0] for name in boxing.PALMS]
+    palms = [s.placed(s.scene.frame(name))[0] for name in PALMS]
     return bool(min(np.linalg.norm(palm - s.placed(target)[0]) for palm in palms) <= reach)
 
 
 def _vis_navi(s: _State) -> bool:
     zone = s.scene.marker(vis_navi.ZONE)
-    feet = [s.row("xpos")[s.scene.link(f"{side}_ankle_roll_link")] for side in ("left", "right")]
+    feet = [s.row("xpos")[s.scene.link(name)] for name in FEET]
     return s.stands and all(_inside(s.seen_from(zone, foot), zone, (0, 1)) for foot in feet)
 
 

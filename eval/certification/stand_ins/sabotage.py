@@ -22,8 +22,8 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification.stand_ins.bodies import Body, WithOtherLegs
 from arena_newton.eval.certification.stand_ins.handling import HANDLING
 from arena_newton.eval.folders.failure_stage import FailureStage
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.interaction_view import InteractionView
-from arena_newton.eval.play.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Spawn, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.policies.base import Mask
@@ -31,11 +31,10 @@ from arena_newton.policies.experts import ExpertPolicy, Sight
 from arena_newton.policies.experts.base import Expert
 from arena_newton.policies.experts.style import Style
 from arena_newton.robot.canonical import ACTION
-from arena_newton.robot.g1 import CANONICAL_JOINTS
+from arena_newton.robot.g1 import CANONICAL_JOINTS, PALMS
 from arena_newton.robot.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
 from arena_newton.tasks.base import Sample
 from arena_newton.tasks.football import GOAL
-from arena_newton.tasks.judge import PALMS
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.motions.commands import MotionCommand
 

@@ -10,7 +10,7 @@ RADIUS, HEIGHT, MASS = 0.25, 1.1, 10.0
 """Of the bin [m, kg]."""
 EDGE = 0.6
 """Of the mark [m]."""
-EYE = (-6.2, -4.6, 2.6)
+EYE = (-5.6, -3.9, 2.1)
 """Position of the world camera [m]."""
 
 

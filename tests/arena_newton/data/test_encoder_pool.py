@@ -14,6 +14,7 @@ import torch
 from arena_newton.data.recording.encoder_pool import EncoderPool
 from arena_newton.data.recording.encoding import EncoderThreads, Pictured
 from tests.children import Child
+from tests.patience import wait_for
 
 WORLDS, TICKS, SIZE = 5, 14, 64
 CPU = torch.device("cpu")
@@ -111,8 +112,8 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
 
 def children(parent, wanted):
     """Process numbers of the encoders of a process, once so many run."""
-    until = time.monotonic() + 30
-    while time.monotonic() < until:
+
+    def all_of_them():
         found = []
         for entry in os.listdir("/proc"):
             with contextlib.suppress(OSError, ValueError, IndexError):
@@ -121,10 +122,9 @@ def children(parent, wanted):
                 with open(f"/proc/{int(entry)}/cmdline") as file:
                     if int(status[1]) == parent and "encoder_process" in file.read() and status[0] != "Z":
                         found.append(int(entry))
-        if len(found) == wanted:
-            return found
-        time.sleep(0.05)
-    pytest.fail(f"{found} instead of {wanted} encoders")
+        return found if len(found) == wanted else None
+
+    return wait_for(all_of_them, f"{wanted} encoders")
 
 
 def test_a_killed_process_is_one_clear_error(tmp_path):
@@ -136,7 +136,7 @@ def test_a_killed_process_is_one_clear_error(tmp_path):
     victim = min(children(os.getpid(), 2))  # processes are started in their order
     os.kill(victim, signal.SIGKILL)
     with pytest.raises(ChildProcessError, match=r"a process that encodes pictures ended \(SIGKILL; out of memory\?\)"):
-        for _ in range(200):
+        while True:
             pool.add(
                 "front", streams, torch.zeros(2, SIZE, SIZE, 3, dtype=torch.uint8), torch.zeros(2, SIZE, SIZE).half()
             )
@@ -169,11 +169,8 @@ def test_no_process_outlives_a_killed_recorder(tmp_path):
         encoders = children(run.pid, 2)
     finally:
         run.kill()
-        run.wait(30)
-    until = time.monotonic() + 10
-    while any(os.path.exists(f"/proc/{one}") for one in encoders) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not [one for one in encoders if os.path.exists(f"/proc/{one}")]
+        run.wait()
+    wait_for(lambda: not any(os.path.exists(f"/proc/{one}") for one in encoders), "end of the encoders")
 
 
 @pytest.mark.parametrize("torn", ["_transmit", "_hear"])

@@ -63,7 +63,7 @@ def test_full_slots_hold_back_whoever_brings_pictures():
     time.sleep(0.05)
     assert not taken and (first.picture(1) == 7).all() and second is not first  # it has another user
     slots.release(first)
-    waiting.join(5)
+    waiting.join(60)
     assert taken == [first]
 
 

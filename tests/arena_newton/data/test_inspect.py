@@ -169,7 +169,7 @@ def test_the_page_in_a_browser(folder, tmp_path):
     assert main(["inspect", str(folder), "--out", str(out)]) == 0
     flags = ["--headless", "--no-sandbox", "--hide-scrollbars", f"--user-data-dir={tmp_path / 'profile'}"]
     flags += ["--enable-logging=stderr", f"--screenshot={shot}", "--window-size=1200,1400", f"file://{out}"]
-    log = subprocess.run([browser, *flags], capture_output=True, text=True, timeout=120).stderr
+    log = subprocess.run([browser, *flags], capture_output=True, text=True, timeout=500).stderr
     assert "Content Security Policy" not in log, log
     picture = cv2.imread(str(shot)).astype(int)
     for colour in ((47, 111, 179), (217, 130, 43)):  # --c0 and --c1 of the style

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -21,7 +20,7 @@ from arena_newton.files.new_folder import new_folder
 with new_folder(Path(sys.argv[1])) as folder:
     (folder / "half").write_text("half")
     print("writing", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
@@ -55,7 +54,7 @@ def test_a_held_file_is_shared_or_waited_for(tmp_path):
             waiting = pool.submit(lambda: held(path, wait=True).__enter__())
             with pytest.raises(TimeoutError):
                 waiting.result(0.2)
-        assert waiting.result(20.0) >= 0
+        assert waiting.result(60.0) >= 0
 
 
 def test_a_file_that_was_removed_meanwhile_is_not_held(tmp_path, monkeypatch):
@@ -94,15 +93,8 @@ def test_a_killed_process_leaves_no_folder_and_the_next_one_sweeps(tmp_path):
     with pytest.raises(InputError, match="another process is writing it"), new_folder(out):
         pass
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.wait()  # the lock goes with the process
     assert not out.exists() and (tmp_path / f"out{PARTIAL}" / "half").exists()
-    for _ in range(50):  # the lock goes with the process
-        with open(tmp_path / f"out{LOCK}") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                time.sleep(0.1)
     with new_folder(out) as folder:
         (folder / "whole").write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

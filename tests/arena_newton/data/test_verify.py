@@ -6,7 +6,6 @@ import random
 import shutil
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -340,14 +339,17 @@ def test_the_first_mismatch_is_that_of_any_number_of_threads(many_files, tmp_pat
 def test_an_interruption_ends_the_threads(many_files, monkeypatch):
     """Ctrl-C while videos are decoded ends every thread at its next frame."""
     files = DatasetFiles(many_files[0])
-    decoded = []
+    decoded, means, interrupted = [], [], threading.Event()
 
     def slow(frame):
-        time.sleep(0.02)
+        means.append(frame)
+        if len(means) > 10:
+            interrupted.wait(60.0)
         return np.full(3, 127.5)
 
     def interrupt(count):
         decoded.append(count)
+        interrupted.set()
         raise KeyboardInterrupt
 
     monkeypatch.setattr(video_checks, "_mean", slow)

@@ -27,7 +27,7 @@ from arena_newton.eval.adapters.protocol_comparison import (
     protocol_table,
 )
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.replay import ReplayEpisodes
 
@@ -170,7 +170,7 @@ def test_a_server_ends_with_its_protocol(tmp_path, monkeypatch, deaf):
     """It is asked by the address that it prints, and ended by Ctrl-C, or killed where it does not hear."""
     monkeypatch.setattr(protocol_comparison, "END_S", 0.3 if deaf else 30.0)
     hears = "signal.signal(signal.SIGINT, signal.SIG_IGN if deaf else lambda *_: (print('bye', flush=True), exit()))"
-    text = f"deaf = {deaf}\n{hears}\nprint('{protocol_comparison.ADDRESS}openpi:here', flush=True)\ntime.sleep(60)"
+    text = f"deaf = {deaf}\n{hears}\nprint('{protocol_comparison.ADDRESS}openpi:here', flush=True)\ntime.sleep(600)"
     command, log = program(tmp_path, monkeypatch, text)
     with protocol_comparison._server("openpi", command, log) as spec:
         assert spec == "openpi:here"

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import re
 import shutil
 
 import numpy as np
@@ -126,6 +127,21 @@ def test_forgeries_are_found(folder, name):
     forge(folder, FORGERIES[name], tables=name not in TABLES)
     level, found = level_of(folder, published, factories=factories())
     assert bool(found) and level == LEVEL.get(name, "lines"), found
+
+
+def test_a_page_of_another_template_is_no_edited_page(folder, capsys):
+    """Another style, markup or sentence of a report's page is a note; a changed figure or outcome contradicts."""
+    page = folder / "report.html"
+    text = page.read_text()
+    other = text.replace("<style>", "<style>p { color: red }").replace('class="', 'class="new ')
+    page.write_text(other.replace("</main>", "<p>A sentence of another template.</p></main>"))
+    assert main(["audit", str(folder)]) == 0
+    assert "report.html was written with another template: its figures and names" in capsys.readouterr().out
+    for old, new in ((r">\d+\.\d ", ">99.9 "), (">timeout<", ">success<")):
+        page.write_text(re.sub(old, new, other, count=1))
+        assert page.read_text() != other, old
+        code, found = audit(folder, capsys)
+        assert code == 1 and len(found) == 1 and "report.html: is not what journal and configuration give" in found[0]
 
 
 class Other(FakePolicy):

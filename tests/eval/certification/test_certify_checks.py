@@ -16,8 +16,9 @@ from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
 from arena_newton.eval.certification.finding import Score, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.pages.tables import Table
+from arena_newton.physics import batch
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
@@ -193,6 +194,23 @@ def test_a_mode_that_moves_more_is_found(tmp_path, monkeypatch):
     text = (tmp_path / "certify_1.md").read_text()
     assert "boxing under paper: mode semantic moves boxing\\_target" in text.replace("boxing_target", "boxing\\_target")
     assert "z is drawn from 1." in text
+
+
+def test_dynamics_that_change_more_are_found(tmp_path, monkeypatch):
+    """The mode passes its check; one that also damps the joints fails it, by the field and by the bits of base mode."""
+    options = CertifyOptions(out=str(tmp_path / "honest"), task=("boxing",), checks=("dynamics",), quick=True)
+    assert certify.run(options) == 0
+    honest = batch.varied
+
+    def damped(model, robot, sample):
+        own = honest(model, robot, sample)
+        own.dof_damping[:] += 0.1
+        return own
+
+    monkeypatch.setattr(batch, "varied", damped)
+    assert certify.run(dataclasses.replace(options, out=str(tmp_path / "damped"))) == 1
+    text = (tmp_path / "damped" / "certify.md").read_text().replace("\\_", "_")
+    assert "boxing: dof_damping is not as drawn" in text and "usual values differ from base mode from tick" in text
 
 
 def test_numbers_of_the_protocol():

@@ -97,7 +97,7 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     """Ctrl-C ends the processes that play and starts no other one."""
     log = stand_in(tmp_path, monkeypatch)
     program = tmp_path / "python"
-    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 60\n')
+    program.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexec sleep 600\n')
 
     def interrupt():
         while not log.exists() or log.read_text().count("\n") < 2:
@@ -109,7 +109,7 @@ def test_an_interrupt_stops_all_processes(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         jobs.play_ahead(CertifyOptions(out="x", jobs=2), ["football", "boxing"], ["solvable"], lambda text: None)
     both.join()
-    assert time.monotonic() - began < 30.0 and log.read_text().count("\n") == 2
+    assert time.monotonic() - began < 300.0 and log.read_text().count("\n") == 2
 
 
 def test_engines_is_left_to_the_check_without_cuda_unless_it_was_named(tmp_path, monkeypatch):

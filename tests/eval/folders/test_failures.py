@@ -41,17 +41,17 @@ from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_sta
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.folders.results import OWN_FOLDER, load_run
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.own_tracker import own_options
-from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.signal_recorder import SEEN, SignalRecorder
 from arena_newton.eval.records.journal import EpisodeRecord, Journal, read_journal
 from arena_newton.eval.reports import report
 from arena_newton.policies.experts import ExpertPolicy, Sight
-from arena_newton.robot.g1 import DEFAULT_POSE, LEGS
+from arena_newton.robot.g1 import DEFAULT_POSE, LEGS, TOE
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-from arena_newton.tasks.football import BALL, GOAL, TOE
+from arena_newton.tasks.football import BALL, GOAL
 from arena_newton.trackers.motions.commands import MotionCommand
 
 NOT_NEAR = UNTOUCHED | {"engaged_ticks": 0, "aligned_ticks": 0, "stop_distance": None, "stop_bearing": None}

@@ -1,5 +1,6 @@
 """Leaderboard: entries are held to their schema and their bundles, and the site shows what they say and no more."""
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from eval_fakes import factories
+from made_signals import signals
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.leaderboard.entry_file import BoardEntry
@@ -93,6 +95,45 @@ def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
     for page in site.glob("*.html"):
         assert all((site / address).is_file() for address in Page(page).addresses), page
     assert main(["bundle", str(made.parent / "run"), "--out", str(entry)]) == 2
+
+
+def filmed(run):
+    """Give the run's lines strips and signals of failures, links and tables."""
+    members = {"episodes.jsonl": (run / "episodes.jsonl").read_bytes()}
+    lines = [json.loads(line) for line in members["episodes.jsonl"].splitlines()]
+    (run / "strips").mkdir()
+    for line in lines:
+        line["signals"] = dataclasses.asdict(signals(engaged_ticks=0))
+        line["media"]["world strip"] = f"strips/{line['index']}.jpg"
+        (run / line["media"]["world strip"]).write_bytes(b"picture %d" % line["index"])
+    relinked(members, lines)
+    (run / "episodes.jsonl").write_bytes(members["episodes.jsonl"])
+    assert main(["report", str(run)]) == 0
+    return lines
+
+
+def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
+    """Drive, fast physics and weights other than those that ship are on the board; failures and strips on the page."""
+    (tmp_path / "own.safetensors").write_bytes(b"own weights")
+    flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "9"]
+    flags += ["--fast-physics", "--drive", "humanoidarena", "--checkpoint", str(tmp_path / "own.safetensors")]
+    assert main([*flags, "--out", str(tmp_path / "run")], factories()) == 0
+    lines = filmed(tmp_path / "run")
+    assert main(["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "ours"), "--strips", "9"]) == 0
+    fill(tmp_path / "ours", **KEYS)
+    code, said, site = build(tmp_path / "ours", capsys)
+    assert code == 0, said
+    weights = lines[0]["hashes"]["checkpoint"]
+    board, page = ((site / name).read_text() for name in ("index.html", "ours.html"))
+    assert f"<small>drive humanoidarena, fast physics, other weights {weights}</small>" in board and weights in page
+    outcomes = {line["outcome"] for line in lines}
+    shown = Page(site / "ours.html").addresses
+    pictures = {path for path in shown if path.endswith(".jpg")}
+    assert len(pictures) == len(outcomes) > 1 and all((site / path).is_file() for path in pictures)
+    stages = re.findall(r'data-label="([^"]+)">(\d+)</td>', page[page.index("<h2>Failures by stage") :])
+    counts = {name: int(number) for name, number in stages}
+    lost = sum(line["outcome"] != "success" for line in lines)
+    assert counts.pop("episodes") == 9 and counts.pop("success") == 9 - lost and sum(counts.values()) == lost > 0
 
 
 @pytest.mark.parametrize(
@@ -252,7 +293,7 @@ def test_the_board_in_a_browser(tmp_path, monkeypatch):
     command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900", "--virtual-time-budget=2000"]
     command += ["--dump-dom", (tmp_path / "probe.html").as_uri()]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    page = subprocess.run(command, capture_output=True, text=True, timeout=500).stdout
     frames = [frame.split(",") for frame in re.search("<p>(.*)</p>", page)[1].split(";")]
     for width, limit, before, after, sort, values in frames:
         rates = [float(value) for value in values.split()]

@@ -49,7 +49,7 @@ def looped(tmp_path_factory, parts):
     played(learning_loop, "train", stop)
     made = {path: path.stat().st_mtime_ns for path in sorted((out / "dataset").rglob("*")) if path.is_file()}
     process = Child("killed_loop", flags)
-    assert process.wait(300) == -signal.SIGKILL, process.communicate()
+    assert process.wait() == -signal.SIGKILL, process.communicate()
     played(Journal, "append", lambda *given: (append(*given), stop()))
     assert len(load_run(out / "evaluation").records) == 1
     played(Journal, "append", append)

@@ -101,7 +101,7 @@ def test_pictures_of_the_sensors_shape_have_no_bars():
         ({"cameras": (), "depth": True}, "^--depth:"),
         ({"looks": 3}, "^--looks 3: expected 0 to 2"),
         ({"looks": 1, "cameras": ("world",)}, "^--looks: are those of the camera front"),
-        ({"looks": 1, "mode": ("base", "visual")}, "^--looks: belongs to modes base and execution, not visual"),
+        ({"looks": 1, "mode": ("base", "visual")}, "^--looks: belongs to modes without looks of their own, not visual"),
         ({"episodes": 0}, "--episodes 0"),
         ({"episodes": 10**9}, "--episodes: makes"),
         ({"seed_series": 10**20}, "--seed-series 1000"),

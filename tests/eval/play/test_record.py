@@ -19,11 +19,12 @@ from arena_newton.data.recording.episode import EpisodeFile, episode_files
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.play import recording
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.settings import CameraConfig
 from tests.children import Child
+from tests.patience import wait_for
 
 SMALL = ["--task", "boxing", "--size", "64x64", "--engine", "mujoco", "--device", "cpu"]
 COUNT = 3
@@ -144,10 +145,9 @@ def test_a_killed_encoder_stops_the_run(brief, tmp_path, parts, monkeypatch, cap
 
 def test_kills_lose_at_most_what_was_running(brief, tmp_path, parts):
     """Killed while it writes and resumed by another process, a recording has the bytes of a whole one."""
-    folder, began = tmp_path / "killed", time.monotonic()
+    folder = tmp_path / "killed"
     run = Child("quick_worlds", ["record", *BRIEF, "--worlds", "2", "--out", str(folder)])
-    while not list(folder.glob("episodes/**/*.part")) and time.monotonic() - began < 300 and run.poll() is None:
-        time.sleep(0.01)
+    wait_for(lambda: list(folder.glob("episodes/**/*.part")) or run.poll() is not None, "partial file", 400.0)
     run.kill()
     assert run.wait() == -signal.SIGKILL, run.printed()
     records, _ = read_journal(folder / "episodes.jsonl")

@@ -1,6 +1,7 @@
 """Reports are derived from configuration and journal alone, and hold what a reader needs."""
 
 import base64
+import dataclasses
 import hashlib
 import json
 import random
@@ -17,8 +18,9 @@ from rows import episodes, made, record
 
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import RunRecord, load_run, results_json
+from arena_newton.eval.plan.options import Remote
 from arena_newton.eval.reports import report
-from arena_newton.eval.reports.wording import REMOTE, replay_command, rules_that_ran
+from arena_newton.eval.reports.wording import replay_command, rules_that_ran
 from arena_newton.eval.statistics.stats import error_reasons, wilson
 
 
@@ -232,7 +234,10 @@ def test_command_asks_a_policy_server_in_the_same_way():
     words = shlex.split(replay_command(options, episode, 7))
     assert {"--remote-insecure", "--remote-sequential"} <= set(words) and "--remote-retries" not in words
     assert words[words.index("--remote-timeout") + 1] == "3.5" and words[words.index("--worlds") + 1] == "7"
-    plain = {"policy": "remote:http://host:1"} | REMOTE
+    program = {"policy": "process:python agent.py", "remote_timeout": 3.5, "remote_retries": 2}
+    words = shlex.split(replay_command(program, episode))
+    assert "--remote-timeout" in words and "--remote-retries" not in words
+    plain = {"policy": "remote:http://host:1"} | dataclasses.asdict(Remote())
     assert not [word for word in shlex.split(replay_command(plain, episode)) if word.startswith("--remote")]
 
 
@@ -378,7 +383,7 @@ def test_page_in_a_browser(tmp_path, browser):
     command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900", "--virtual-time-budget=2000"]
     command += ["--dump-dom", (tmp_path / "probe.html").as_uri()]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    page = subprocess.run(command, capture_output=True, text=True, timeout=500).stdout
     frames = [frame.split(",") for frame in re.search("<p>(.*)</p>", page)[1].split(";")]
     assert all(frame[2] == "false" and "12 of 12 episodes" in frame[3] for frame in frames), frames
     narrow, small, wide, large = (int(number) for frame in frames for number in frame[:2])

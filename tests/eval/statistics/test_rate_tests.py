@@ -316,7 +316,7 @@ def test_many_episodes_take_no_time():
     assert mcnemar(50_100, 49_900) == pytest.approx(binomtest(49_900, 100_000).pvalue, rel=1e-8)
     n = 1500
     p = stratified_test([UnpairedCounts(n // 2, n, n // 2 - 10, n)] * 7 + [PairedCounts(0, 900, 880, 9)])
-    assert time.perf_counter() - began < 10.0  # with whole numbers of thousands of digits it took hours
+    assert time.perf_counter() - began < 120.0  # with whole numbers of thousands of digits it took hours
     exact = normal_tail(excess([UnpairedCounts(n // 2, n, n // 2 - 10, n)] * 7 + [PairedCounts(0, 900, 880, 9)]), n)
     assert p == pytest.approx(exact, rel=0.01)
 

@@ -36,7 +36,7 @@ def test_the_same_bytes_of_a_checkpoint(tmp_path):
     (tmp_path / "suite.toml").write_text(SUITE)
     for out, flags in (("alone", []), ("ray", ["--ray", "--ray-cpus", "1", "--ray-actors", "1"])):
         command = [sys.executable, "-m", "arena_newton.eval", "matrix", "suite.toml", "--out", out, *flags]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400)
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=500)
         assert done.returncode == 0, done.stdout + done.stderr
         for cell in read_suite(tmp_path / out).cells:
             assert cell.status == "done"

@@ -114,7 +114,7 @@ def test_poison_and_a_deadline(nodes, alone, poison, tmp_path):
     poison.write_text(f"die {dies['episode_seed']} hang {hangs['episode_seed']}")
     try:
         run = start(nodes, tmp_path / "run", "--ray-attempts", "1", "--ray-minutes", "0.15")
-        said, _ = run.communicate(timeout=240)
+        said, _ = run.communicate(timeout=500)
     finally:
         poison.unlink()
     assert run.returncode == 1, said
@@ -156,7 +156,7 @@ def test_kill_9_in_a_suite(nodes, tmp_path):
 
             wait_for(another, "cell of another process", 300)
             os.kill(nodes.actors()[killed % len(nodes.actors())], 9)
-        said, _ = run.communicate(timeout=240)
+        said, _ = run.communicate(timeout=500)
     finally:
         run.kill()
     assert run.returncode == 0, said

@@ -363,7 +363,6 @@ def test_a_full_disk_leaves_nothing(copied, monkeypatch, capsys):
     assert not list(copied.glob("m*"))
 
 
-@pytest.mark.timeout(600)
 def test_a_real_run(tmp_path, parts):
     """On engine mujoco two shards with other numbers of worlds give one machine's bytes, with strips and films."""
     flags = ["--task", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "3", "--max-steps", "6"]
@@ -386,7 +385,6 @@ def test_a_real_run(tmp_path, parts):
     assert configuration(tmp_path / "m") == configuration(tmp_path / "one")
 
 
-@pytest.mark.timeout(300)
 def test_recorded_shards(tmp_path, parts):
     """Two shards of a recording give the files of one machine's, which the merged folder counts as recorded."""
     flags = "--task boxing --episodes 3 --engine mujoco --size 64x64 --max-steps 4".split()

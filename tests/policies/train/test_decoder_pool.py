@@ -6,7 +6,6 @@ import os
 import resource
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from arena_newton.policies.train.frames.decoder_pool import DecoderPool, decodin
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
 from arena_newton.policies.train.frames.frame_store import episode_films, load_frames
 from tests.children import Child
+from tests.patience import wait_for
 from tests.policies.train.small_dataset import BAND, LENGTHS, SIZE, make_dataset
 
 CPU = torch.device("cpu")
@@ -163,10 +163,8 @@ def test_processes_end_with_a_training_that_is_killed():
     numbers = " ".join(training.lines(1)).split()
     training.kill()
     assert len(numbers) == 2, training.printed()
-    limit = time.monotonic() + 300  # a process hears of it when its libraries are loaded
-    while any(running(number) for number in numbers):
-        assert time.monotonic() < limit
-        time.sleep(0.05)
+    # A process hears of it when its libraries are loaded.
+    wait_for(lambda: not any(running(number) for number in numbers), "end of the processes", 400.0)
 
 
 def running(number):

@@ -1,0 +1,176 @@
+"""Modes of an episode: what each changes about base mode, and from which ranges; also those of other packages."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from arena_newton.cli.registry import Registry
+from arena_newton.errors import InputError
+from arena_newton.rules import seeding
+from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
+
+__all__ = ["BUILT_IN", "DYNAMICS", "HELD_OUT", "QUANTITIES", "Mode", "Quantity"]
+__all__ += ["get", "names", "register", "unregister"]
+
+DYNAMICS = "dynamics"
+"""Record name of what a mode draws about an episode's dynamics, next to the names of the objects."""
+MOST_LATENCY = 10
+"""Longest latency [ticks]."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number about the dynamics of an episode."""
+
+    usual: float
+    """Value that changes nothing."""
+    unit: str
+    sentence: str
+    whole: bool = False
+    """True if it is drawn among whole numbers, both bounds included."""
+
+
+QUANTITIES: Mapping[str, Quantity] = {
+    "friction": Quantity(1.0, "", "factor of the sliding friction of every surface"),
+    "robot_mass": Quantity(1.0, "", "factor of mass and inertia of every link of the robot"),
+    "object_mass": Quantity(1.0, "", "factor of mass and inertia of every other body"),
+    "gains": Quantity(1.0, "", "factor of stiffness and damping of the drives of the 29 joints"),
+    "state_latency": Quantity(0.0, "ticks", "age of the robot's state that policy and tracker get", whole=True),
+    "action_latency": Quantity(0.0, "ticks", "ticks by which joint targets reach the drives late", whole=True),
+    "push": Quantity(0.0, "m/s", "sudden change of the base's horizontal velocity"),
+    "push_heading": Quantity(0.0, "rad", "direction of that push in the world, from x"),
+    "push_time": Quantity(0.0, "", "its time after step 0, as a fraction of the rule set's step budget"),
+}
+"""Everything that a mode may draw about an episode's dynamics."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mode:
+    """One mode; everything that lists modes or asks what one changes reads it from here."""
+
+    name: str
+    sentence: str
+    """Change against base mode, in a sentence without a full stop."""
+    placements: Callable[[ObjectRule], PoseRange | CylinderRange] = lambda rule: rule.base
+    """Range from which an object's placement is drawn, of those that the rule set has or another one."""
+    scene: Literal["base", "semantic", "layer"] = "base"
+    """The scene itself, its semantic variant, or a layer of its own, `variants/<mode>.usda` next to the scene."""
+    light: Callable[[RuleSet], LightRange] | None = None
+    """Range from which a distant light is drawn; None: the light of the scene."""
+    dynamics: Mapping[str, Range] = field(default_factory=dict)
+    """Name of one of `QUANTITIES` → the range from which an episode's value is drawn, under both rule sets."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            InputError: An unknown quantity, or a range that is none.
+        """
+        for name, (low, high) in self.dynamics.items():
+            if name not in QUANTITIES:
+                raise InputError(f"mode {self.name}: {name} is none of {', '.join(QUANTITIES)}")
+            whole, signed = QUANTITIES[name].whole, name == "push_heading"
+            if not low <= high or (low < 0.0 and not signed) or (whole and not float(high).is_integer()):
+                raise InputError(f"mode {self.name}: {name}: {low:g} to {high:g} is not a range of it")
+            if whole and high > MOST_LATENCY:
+                raise InputError(f"mode {self.name}: {name}: {high:g}, expected at most {MOST_LATENCY} ticks")
+
+    @property
+    def ruled(self) -> bool:
+        """True if the hash of a rule set holds all its ranges."""
+        return self.name in BUILT_IN and not self.dynamics
+
+    @property
+    def looks(self) -> bool:
+        """True if its pictures differ from those of base mode."""
+        return self.scene != "base" or self.light is not None
+
+    def draw(self, episode_seed: int) -> dict[str, float]:
+        """Dynamics of an episode: one value per range, each by a generator of its own."""
+        found = {}
+        for name, (low, high) in self.dynamics.items():
+            rng = seeding.dynamics_rng(episode_seed, name)
+            found[name] = float(rng.randint(int(low), int(high))) if QUANTITIES[name].whole else rng.uniform(low, high)
+        return found
+
+    def hash_for(self, rules: RuleSet, tasks: Iterable[str]) -> str:
+        """Hash of its ranges and of its scene's name, for some tasks under a rule set: 12 hex digits."""
+        objects = [one for task in sorted(tasks) for one in rules.task(task).objects]
+        ranges = [[one.record, dataclasses.asdict(self.placements(one))] for one in objects]
+        light = None if self.light is None else dataclasses.asdict(self.light(rules))
+        text = json.dumps([self.scene, ranges, light, sorted(self.dynamics.items())], separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+BUILT_IN = {
+    "base": Mode(name="base", sentence="changes nothing"),
+    "execution": Mode(
+        name="execution", sentence="objects start in wider ranges", placements=lambda rule: rule.execution
+    ),
+    "semantic": Mode(name="semantic", sentence="textures, drawn shapes or decor differ", scene="semantic"),
+    "semantic-2": Mode(
+        name="semantic-2", sentence="a held-out look: others than those of semantic mode", scene="layer"
+    ),
+    "semantic-3": Mode(name="semantic-3", sentence="another held-out look", scene="layer"),
+    "visual": Mode(
+        name="visual",
+        sentence="a distant light of drawn direction, intensity and colour",
+        light=lambda rules: rules.visual_light,
+    ),
+    DYNAMICS: Mode(
+        name=DYNAMICS,
+        sentence="friction, masses, gains and latencies differ, and the robot is pushed once",
+        dynamics={
+            "friction": (0.3, 1.2),
+            "robot_mass": (0.8, 1.2),
+            "object_mass": (0.5, 1.5),
+            "gains": (0.8, 1.2),
+            "state_latency": (0, 1),
+            "action_latency": (0, 1),
+            "push": (0.0, 1.0),
+            "push_heading": (-math.pi, math.pi),
+            "push_time": (0.02, 0.25),
+        },
+    ),
+}
+"""The paper's four test modes, base, execution, semantic and visual; the held-out looks; and dynamics."""
+HELD_OUT = tuple(mode.name for mode in BUILT_IN.values() if mode.scene == "layer")
+"""Modes whose looks are a layer of their own."""
+_MODES = Registry[Mode]("mode", "arena_newton.modes", lambda: Mode, dict.fromkeys(BUILT_IN, ""))
+
+
+def names() -> tuple[str, ...]:
+    """Names of all modes: the built-in ones, then those of other packages."""
+    return (*BUILT_IN, *(name for name in _MODES.names() if name not in BUILT_IN))
+
+
+def get(name: str) -> Mode:
+    """A mode by name.
+
+    Raises:
+        InputError: Unknown name, or a package that offers something else.
+    """
+    if name not in names():
+        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
+    mode = BUILT_IN.get(name) or _MODES.make(name)
+    if mode.name != name:
+        raise InputError(f"--mode {name}: its package calls it {mode.name}; entry point and record need one name")
+    return mode
+
+
+def register(mode: Mode) -> None:
+    """Offer a mode in this process; packages offer theirs as entry points of the group `arena_newton.modes`.
+
+    Raises:
+        InputError: A built-in one has that name.
+    """
+    _MODES.register(mode.name, mode)
+
+
+unregister = _MODES.unregister

@@ -1,0 +1,210 @@
+"""Modes: records of ranges, also of other packages; what dynamics mode draws acts on both engines, and nothing else."""
+
+import dataclasses
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+import torch
+
+from arena_newton import rule_sets, tasks, trackers
+from arena_newton.cli import registry
+from arena_newton.env import ArenaEnv
+from arena_newton.errors import InputError
+from arena_newton.eval.plan.config import resolve
+from arena_newton.eval.plan.options import RunOptions
+from arena_newton.physics.dynamics import Delay
+from arena_newton.rules import modes
+from arena_newton.rules.modes import DYNAMICS, QUANTITIES, Mode
+
+PAPER = rule_sets.get("paper")
+USUAL = {name: quantity.usual for name, quantity in QUANTITIES.items()}
+RANGES = modes.get(DYNAMICS).dynamics
+WORLDS = 4
+NAN = float("nan")
+
+
+WET = Mode(name="wet", sentence="slippery", placements=lambda rule: rule.execution, dynamics={"friction": (0.2, 0.4)})
+"""A mode of another package."""
+
+
+@pytest.fixture
+def offered(monkeypatch):
+    """The mode as an installed package offers it."""
+    point = EntryPoint("wet", f"{__name__}:WET", "arena_newton.modes")
+    monkeypatch.setattr(registry, "_installed", lambda group, path: [point] if group == point.group else [])
+    monkeypatch.setattr(EntryPoint, "load", lambda self: WET)
+
+
+def test_a_mode_of_another_package_is_played_and_hashed(offered):
+    """It is listed behind the built-in ones, draws from its own ranges, and its hash is part of a run's identity."""
+    assert modes.names() == (*modes.BUILT_IN, "wet")
+    spec = tasks.get("football")
+    drawn = [spec.draw(seed, "wet", PAPER) for seed in range(40)]
+    assert all(0.2 <= one.dynamics["friction"] <= 0.4 and len(one.dynamics) == 1 for one in drawn)
+    assert drawn[3].placed == spec.draw(3, "execution", PAPER).placed
+
+    def identity(*names):
+        options = RunOptions(task=("football",), mode=names, policy="stand", tracker=("pd",), engine="mujoco")
+        return resolve(options).identity()
+
+    assert "mode_facts" not in identity("base", "execution", "semantic", "visual")
+    facts = identity("base", "wet", DYNAMICS)["mode_facts"]
+    assert set(facts) == {"wet", DYNAMICS} and "code" in facts["wet"] and "code" not in facts[DYNAMICS]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dynamics": {"weight": (1, 2)}}, "mode wet: weight is none of friction, robot_mass"),
+        ({"dynamics": {"friction": (1.2, 0.3)}}, "mode wet: friction: 1.2 to 0.3 is not a range of it"),
+        ({"dynamics": {"gains": (-0.1, 0.3)}}, "mode wet: gains: -0.1 to 0.3 is not a range of it"),
+        ({"dynamics": {"friction": (NAN, 1.0)}}, "mode wet: friction: nan to 1 is not a range of it"),
+        ({"dynamics": {"action_latency": (0, 1.5)}}, "mode wet: action_latency: 0 to 1.5 is not a range of it"),
+        ({"dynamics": {"state_latency": (0, 11)}}, "mode wet: state_latency: 11, expected at most 10 ticks"),
+    ],
+)
+def test_ranges_that_are_none_are_refused(change, message):
+    """An unknown quantity, reversed bounds, a fraction of a tick: one line that names mode and quantity."""
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(WET, **change)
+
+
+def test_names_are_refused_in_words(offered, monkeypatch):
+    """An unknown mode lists the known ones; a mode has the name that it is found by, and no built-in one."""
+    with pytest.raises(InputError, match="--mode night: unknown, choose from base, .*, dynamics, wet"):
+        modes.get("night")
+    with pytest.raises(InputError, match="mode 'visual': is built in"):
+        modes.register(dataclasses.replace(WET, name="visual"))
+    monkeypatch.setitem(modes._MODES._registered, "dry", WET)
+    with pytest.raises(InputError, match="--mode dry: its package calls it wet; entry point and record need one name"):
+        modes.get("dry")
+
+
+def test_a_hash_holds_all_ranges():
+    """The hash of a mode changes with each range, its light and its scene, and with the rule set where that counts."""
+    mode, changed = (
+        WET,
+        [
+            {"placements": lambda rule: rule.base},
+            {"dynamics": {"friction": (0.2, 0.5)}},
+            {"dynamics": {"gains": (0.2, 0.4)}},
+            {"light": lambda rules: rules.visual_light},
+            {"scene": "semantic"},
+        ],
+    )
+    hashes = {
+        one.hash_for(PAPER, ["double_desk"]) for one in (mode, *(dataclasses.replace(mode, **c) for c in changed))
+    }
+    assert len(hashes) == len(changed) + 1
+    assert mode.hash_for(PAPER, ["double_desk"]) != mode.hash_for(rule_sets.get("released"), ["double_desk"])
+    assert mode.hash_for(PAPER, ["boxing", "football"]) == WET.hash_for(PAPER, ("football", "boxing"))
+
+
+def test_each_quantity_has_a_stream_of_its_own():
+    """Draws fill their ranges and depend on the seed alone; whether another quantity is drawn changes none of them."""
+    drawn = [modes.get(DYNAMICS).draw(seed) for seed in range(400)]
+    for name, (low, high) in RANGES.items():
+        values = np.array([one[name] for one in drawn])
+        assert low <= values.min() and values.max() <= high and np.ptp(values) > 0.9 * (high - low)
+        alone = Mode(name="alone", sentence="", dynamics={name: (low, high)})
+        assert [alone.draw(seed)[name] for seed in range(20)] == values[:20].tolist()
+    values = np.array([[one[name] for name in RANGES] for one in drawn])
+    assert np.abs(np.corrcoef(values.T) - np.eye(len(RANGES))).max() < 0.2
+    assert tasks.get("boxing").draw(7, "base", PAPER).dynamics == {}
+
+
+def test_rows_are_as_late_as_each_world_is():
+    """A delayed row is the one of so many ticks ago, the first one before that; a masked world's past stands still."""
+    delay = Delay(2, 1, torch.device("cpu"))
+    delay.ticks[:] = torch.tensor((0, 2))
+    seen = []
+    for tick in range(5):
+        now = torch.tensor([[float(tick)], [10.0 + tick]])
+        seen.append(delay.late(now)[:, 0].tolist())
+        delay.keep(now, torch.tensor((True, tick != 3)))
+    assert seen == [[0, 10], [1, 10], [2, 10], [3, 11], [4, 11]]
+    delay.forget(torch.tensor((False, True)))
+    assert delay.late(torch.tensor([[5.0], [15.0]]))[:, 0].tolist() == [5, 15]
+
+
+def stood(env: ArenaEnv, given, ticks: int) -> np.ndarray:
+    """Positions of every tick of a robot that stands; `given` is a sample of the dynamics or a mode for each world."""
+    own = env.rules.task(env.spec.name)
+    drawn = env.spec.drawn(5, "base", own)
+    samples = [drawn | {DYNAMICS: one} if isinstance(one, dict) else env.spec.drawn(5, one, own) for one in given]
+    env.reset([5] * env.worlds, samples=samples)
+    found = []
+    for _ in range(ticks):
+        env.step(env._stand.expand(env.worlds, -1))
+        found.append(env.physics.qpos.numpy().copy())
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("engine", "ticks"), [("mujoco", 60), ("warp", 3)])
+def test_worlds_of_one_batch_have_dynamics_of_their_own(engine, ticks):
+    """Usual values give every bit of base mode, drawn ones do not; a world that had others is base mode's again."""
+    env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=WORLDS, engine=engine, device="cpu", threads=1)
+    base = stood(env, ["base"] * WORLDS, ticks)
+    mixed = stood(env, ["base", USUAL, DYNAMICS, {"friction": 0.5, "robot_mass": 1.1}], ticks)
+    again = stood(env, [DYNAMICS, "base", "base", "base"], ticks)
+    env.close()
+    for world, same in enumerate((True, True, False, False)):
+        assert np.array_equal(mixed[:, world], base[:, world]) == same
+        assert np.array_equal(again[:, world], base[:, world]) == (world > 0)
+    assert np.array_equal(again[:, 0], mixed[:, 2])
+
+
+def test_engine_warp_scales_the_fields_of_a_world():
+    """The arrays that engine warp steps are scaled in the worlds that drew so, and in no other."""
+    env = ArenaEnv("pp_box", tracker=trackers.get("pd"), worlds=2, engine="warp", device="cpu")
+    names = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
+    before = {name: getattr(env.physics._m, name).numpy().copy() for name in names}
+    sample = {"friction": 0.5, "robot_mass": 1.25, "object_mass": 2.0, "gains": 1.5}
+    env.physics.set_dynamics(np.arange(2), [{}, sample])
+    after = {name: getattr(env.physics._m, name).numpy() for name in names}
+    ratio = {name: after[name][1] / np.where(before[name][1] == 0, 1, before[name][1]) for name in names}
+    env.close()
+    assert all(np.array_equal(after[name][0], before[name][0]) for name in names)
+    links, box = env.scene.robot.bodies, env.scene.body_id("/World/Box")
+    assert np.allclose(ratio["geom_friction"][:, 0], 0.5) and np.allclose(
+        after["geom_friction"][1, :, 1:], before["geom_friction"][1, :, 1:]
+    )
+    assert np.allclose(ratio["body_mass"][list(links)], 1.25) and np.isclose(ratio["body_mass"][box], 2.0)
+    assert np.allclose(ratio["body_inertia"][box], 2.0)
+    joints = env.scene.robot.joint_ctrl
+    assert np.allclose(ratio["actuator_gainprm"][joints, 0], 1.5) and np.allclose(
+        ratio["actuator_biasprm"][joints, 1:3], 1.5
+    )
+    fingers = env.scene.robot.hand_ctrl
+    assert np.array_equal(after["actuator_gainprm"][1][fingers], before["actuator_gainprm"][1][fingers])
+
+
+def test_pushes_and_latencies_come_when_they_were_drawn():
+    """The base's velocity jumps by the push before its tick; state and targets are as many ticks late as drawn."""
+    env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=3, engine="mujoco", threads=1, rules="released")
+    push = {"push": 0.5, "push_heading": np.pi / 2, "push_time": 3 / env.budget}
+    drawn = env.spec.drawn(5, "base", env.rules.task("boxing"))
+    env.reset(
+        [5] * 3,
+        samples=[drawn, drawn | {DYNAMICS: push}, drawn | {DYNAMICS: {"action_latency": 2, "state_latency": 1}}],
+    )
+    root, jumps, targets, states = env.scene.robot.root_qvel, [], [], []
+    added = env.physics.add_velocity
+
+    def note(change, mask):
+        jumps.append((int(env.tick[1]), change[mask].tolist()))
+        added(change, mask)
+
+    env.physics.add_velocity = note
+    action = env._stand.expand(3, -1).clone()
+    for tick in range(6):
+        action[:, 9:38] = 0.01 * tick
+        states.append(env.observe().state.clone())
+        env.step(action)
+        targets.append(env.loop.targets.clone())
+    env.close()
+    assert jumps == [(3, [pytest.approx([0.0, 0.5, 0, 0, 0, 0], abs=1e-6)])] and root >= 0
+    assert torch.equal(torch.stack(targets)[2:, 2], torch.stack(targets)[:-2, 0])
+    assert torch.equal(targets[0][2], targets[0][0]) and torch.equal(targets[1][2], targets[0][0])
+    assert torch.equal(states[1][2], states[0][2]) and not torch.equal(states[1][0], states[0][0])
