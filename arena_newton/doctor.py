@@ -239,9 +239,9 @@ def _scenes() -> list[Finding]:
     findings = []
     for path in (root / "g1" / "g1.usda", *(spec.layer for spec in tasks.specs())):
         if not path.is_file():
-            name = path.relative_to(root) if path.is_relative_to(root) else path
+            shown = path.relative_to(root) if path.is_relative_to(root) else path
             advice = "install again, or run `python -m scene_builders` in a checkout"
-            findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
+            findings.append(Finding("scenes", f"{shown} is missing", "bad", advice))
     for name in {*tasks.names()} - {spec.name for spec in tasks.specs()}:
         try:
             tasks.get(name)

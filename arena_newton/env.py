@@ -432,8 +432,13 @@ class ArenaEnv:
         self._push(stepping)
         self.physics.set_active(stepping)
         self.physics.step()
+        return self.judge_tick(stepping)
+
+    def judge_tick(self, stepping: np.ndarray) -> np.ndarray:
+        """Judge what the physics has after a tick of some worlds, bool, shape [worlds]; codes as of `step`."""
+        starting = stepping & (self.tick < 0)
         self._stepping.choose(stepping)
-        if worlds is None or np.array_equal(stepping, self.active):
+        if (stepping == self.active).all():
             self.judge.evaluate(self.physics)
             self._rule()
         else:

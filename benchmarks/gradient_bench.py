@@ -22,8 +22,8 @@ BAR = 1e-5
 PARTS = ("positions", "velocities", "targets")
 LOOKS = 5
 """Ticks of an episode from which states are taken."""
-EVERY = 50
-"""Ticks between two of them: from 0.5 s of the episode on, until 4.5 s."""
+EVERY = 30
+"""Ticks between two of them: from 0.3 s of the episode on, until 2.7 s."""
 
 
 def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:

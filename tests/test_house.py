@@ -228,7 +228,7 @@ def test_private_names_stay_at_home():
             for alias in statement.names:
                 if not (source or alias.name).startswith((PACKAGE, *OUTSIDE)):
                     strangers.add((alias.asname or alias.name).split(".")[0])
-        inherited = {"_replace", "_asdict"}
+        inherited = {"_replace", "_asdict", "_fields", "_version", "_is_view"}  # of named tuples and of tensors
         for node in module.nodes:
             if isinstance(node, ast.Attribute) and private(node.attr) and node.attr not in own | inherited:
                 base = ast.unparse(node.value).split(".")[0].split("(")[0]

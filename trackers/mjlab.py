@@ -119,8 +119,8 @@ class MjlabFrontEnd(FrontEnd):
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write the terms."""
-        torch.cat([TERMS[name].value(self, command, state) for name in self.terms], 1, out=self.obs)
-        self.obs.mul_(self._scales)
+        values = [TERMS[name].value(self, command, state) for name in self.terms]
+        self.obs.copy_(torch.cat(values, 1)).mul_(self._scales)
 
     def advance(self, rows: torch.Tensor | None = None) -> None:
         """Nothing: the last action is the base's."""

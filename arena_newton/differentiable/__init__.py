@@ -3,8 +3,9 @@
 `docs/gradients.md` says what is exact, what is estimated and what has no gradient.
 """
 
-from arena_newton.differentiable.closed_loop import Differences, Played, central_differences, play
+from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state
 from arena_newton.differentiable.engine_step import EngineState, EngineStep
+from arena_newton.differentiable.estimates import Differences, Played, central_differences, play
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 
@@ -14,10 +15,13 @@ __all__ = [
     "EngineStep",
     "Played",
     "ReferenceState",
+    "Rolled",
     "RollingBall",
     "ball_flight",
     "central_differences",
+    "closed_loop",
     "play",
     "reference_step",
+    "reset_state",
     "success_margin",
 ]

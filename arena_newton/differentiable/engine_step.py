@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 
@@ -85,10 +86,12 @@ class EngineStep:
             factors: Factors of the model in the order of `parameters`, 1 = as built, shape [worlds, parameters].
 
         Raises:
-            InputError: A tensor of another shape.
+            InputError: A tensor of another shape, or a factor that is not above 0.
         """
         if factors is None:
             factors = torch.ones(len(self._worlds), len(self.parameters))
+        if (factors <= 0.0).any():
+            raise InputError("EngineStep: a factor of the model is not above 0")
         given = (*state, targets, factors)
         model = self._physics.mj_model
         widths = model.nq, model.nv, state.carried.shape[-1], model.nu, len(self.parameters)
@@ -96,6 +99,11 @@ class EngineStep:
             if tensor.shape != (len(self._worlds), width):
                 raise InputError(f"EngineStep: {name} of shape {list(tensor.shape)}, not {[len(self._worlds), width]}")
         return EngineState(*_Tick.apply(self, *(tensor.cpu().double() for tensor in given)))
+
+    @property
+    def data(self) -> list[mujoco.MjData]:
+        """MuJoCo's data of each world as the last tick forward left it, contact forces included."""
+        return [world.data for world in self._worlds]
 
     def stacked(
         self, work: Callable[..., Sequence[np.ndarray]], *rows: Iterable[np.ndarray | Inputs]
