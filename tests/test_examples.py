@@ -40,7 +40,7 @@ SAYS = {
     "aim_a_kick": r" margin \+0.0\d+ m\n(.*\n)?.*  margin \+0.1\d+ m\nin the engine: margin \+0.\d+ m, .* cm apart",
     "compare_runs": r"expert: 0 of 4, 0 that the other loses\n.*stand: 0 of 4.*\nprobability .* by luck: 1\n",
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
-    "fit_motion": r"(gradient  .* s  misfit 0\.\d+\n){2}(CEM       .* s  misfit \d\.\d+\n)+",
+    "fit_motion": r"(gradient  misfit 0\.\d+ .* s\n){2}(CEM       misfit \d\.\d+ .* s\n)+",
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "identify_robot": r"(gradient  .* s  error +\d.* %, at most .* %\n){2}(CEM       .* s  error +\d.* %\n)+",
     "own_metric": r"boxing \| twist2  \| stand  \| base \| highest_speed \| 1 \| 0\.\d+ ± 0 \| 0\.\d+ to 0\.\d+ \|\n",
