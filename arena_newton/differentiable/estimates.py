@@ -6,7 +6,7 @@ it has parameters, all from one episode seed: the worlds then differ by what was
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -20,7 +20,7 @@ from arena_newton.robot.canonical import STAND_ACTION
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
 
-__all__ = ["Differences", "Played", "central_differences", "play"]
+__all__ = ["Differences", "Played", "Reach", "central_differences", "cross_entropy", "play", "reach"]
 
 
 class Differences(NamedTuple):
@@ -71,6 +71,71 @@ def central_differences(
     return Differences(
         gradient.to(flat.dtype).reshape(at.shape), bend.abs().to(flat.dtype).reshape(at.shape), float(value[0])
     )
+
+
+class Reach(NamedTuple):
+    """A slope beside differences at two scales; all of the parameters' shape."""
+
+    slope: torch.Tensor
+    """The local slope that was given."""
+    near: torch.Tensor
+    """Central differences at the smaller scale."""
+    far: torch.Tensor
+    """Central differences at the larger scale."""
+    holds: torch.Tensor
+    """True where both differences agree with the slope: bool."""
+
+
+def reach(
+    function: Callable[[torch.Tensor], torch.Tensor],
+    at: torch.Tensor,
+    slope: torch.Tensor,
+    scales: tuple[float | torch.Tensor, float | torch.Tensor],
+    *,
+    rows: int,
+    tolerance: float = 0.25,
+) -> Reach:
+    """Differences at the scales of a decision beside an exact slope, which they may contradict.
+
+    Through an impact a slope may be exact and mean nothing, because the outcome is a sawtooth of the moment of touch.
+
+    Args:
+        function: As `central_differences` takes it.
+        at: The parameters at which the slope is.
+        slope: The exact gradient, shape of the parameters.
+        scales: Two steps to either side in the units of the parameters, as `central_differences` takes them.
+        rows: Points that `function` takes at once.
+        tolerance: Difference that is no contradiction, as a fraction of the larger of slope and difference.
+    """
+    near, far = (central_differences(function, at, scale, rows=rows).gradient for scale in scales)
+    agree = [(one - slope).abs() <= tolerance * torch.maximum(one.abs(), slope.abs()) for one in (near, far)]
+    return Reach(slope, near, far, agree[0] & agree[1])
+
+
+def cross_entropy(
+    function: Callable[[torch.Tensor], torch.Tensor], mean: torch.Tensor, width: torch.Tensor | float, *, draws: int
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Minimise one number without gradients by the cross-entropy method: what a descent along a gradient has to beat.
+
+    Each generation is drawn from independent normal distributions, which then take mean and spread of its best sixth
+    (Rubinstein, R. and Kroese, D. (2004): The Cross-Entropy Method).
+
+    Args:
+        function: (points [draws, ...]) → values [draws].
+        mean: Mean of the first generation, any shape.
+        width: Its standard deviation, one number or one per parameter.
+        draws: Points of a generation.
+
+    Yields:
+        The mean of the best of a generation, and the values of all, without end.
+    """
+    while True:
+        points = mean + width * torch.randn(draws, *mean.shape, dtype=mean.dtype, device=mean.device)
+        with torch.no_grad():
+            values = function(points)
+        best = points[values.argsort()[: max(2, draws // 6)]]
+        mean, width = best.mean(0), best.std(0)
+        yield mean, values
 
 
 class Played(NamedTuple):

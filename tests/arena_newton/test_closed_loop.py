@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from arena_newton import ArenaEnv, canonical, policies, trackers
-from arena_newton.differentiable import closed_loop, reset_state
+from arena_newton import ArenaEnv, Rollout, canonical, policies, trackers
+from arena_newton.differentiable import closed_loop, reach, reset_state, soft_onset
 from arena_newton.errors import InputError
 from arena_newton.interfaces import Chunk
 
@@ -203,3 +203,37 @@ def test_what_has_no_gradient_is_refused(hall):
         closed_loop(hall, plan(3), [SEED], 4)
     with pytest.raises(InputError, match=r"tracker tracker has no gradient"):
         trackers.Tracker().graded(1)
+
+
+def test_reach_tells_a_slope_that_holds_from_one_that_does_not():
+    """A slope that differences at one of two scales contradict is flagged, as of a sawtooth on a trend."""
+
+    def sawtooth(points):
+        return points[:, 0] + points[:, 1] - 5.0 * ((points[:, 1] / 4e-3) % 1.0 - 0.5) * 4e-3
+
+    found = reach(
+        sawtooth, torch.tensor([0.1, 0.0501]).double(), torch.tensor([1.0, -4.0]).double(), (5e-4, 2e-2), rows=5
+    )
+    torch.testing.assert_close(found.near, found.slope, atol=1e-6, rtol=0.0)
+    assert abs(found.far[1] - 1.0) < 0.3 and found.holds.tolist() == [True, False]
+
+
+def test_a_planning_model_is_no_engine():
+    """A contact that begins smoothly is another world: it names itself, plays no episode and refuses unfit prims."""
+    env = worlds("football", "pd")
+    robot = env.scene.geom_ids("/World/Robot")
+    before = env.physics.mj_model.geom_solimp.copy()
+    with pytest.raises(InputError, match="prim /World/Light holds no collision geometry"):
+        soft_onset(env, "/World/Light")
+    with pytest.raises(InputError, match="width 0 m, expected more than 0"):
+        soft_onset(env, "/World/Ball", width=0.0)
+    soft_onset(env, "/World/Ball", width=0.02)
+    after, ball = env.physics.mj_model.geom_solimp, env.scene.geom_ids("/World/Ball")
+    assert (after[ball, 0] == 1e-4).all() and (after[ball, 2] == 0.02).all()
+    assert np.array_equal(after[robot], before[robot])
+    assert env.describe()["engine"] == "mujoco, planning model: /World/Ball touches over 0.02 m"
+    with pytest.raises(InputError, match="planning model .* no episode is played"):
+        Rollout(env, policies.get("stand"), [])
+    with torch.no_grad():
+        assert closed_loop(env, plan(2), [SEED], 2).qpos.isfinite().all()
+    env.close()
