@@ -195,3 +195,5 @@ class GradientBenchOptions(PlainBenchOptions):
     """Trackers, whose drives differ."""
     states: int = field(default=20, metadata=bounds(2, 10_000))
     """States of each task and tracker."""
+    loops: Several[str] = ("vis_navi", "sit_sofa")
+    """Tasks of the closed loops: the experts walk, and sit down."""
