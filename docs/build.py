@@ -26,10 +26,11 @@ READING = {
     "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
     "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
         docs/design/identity""",
-    "How-to": """docs/policies docs/serving docs/asking_servers docs/trackers docs/authoring docs/research docs/experts
-        docs/recording docs/datasets docs/curation docs/training docs/training_policies docs/recipes docs/loop
-        docs/suites docs/machines docs/comparing docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation
-        docs/gym docs/motions docs/gradients docs/api examples/index""",
+    "How-to": """docs/policies docs/checkpoints docs/policy_server docs/serving docs/asking_servers docs/trackers
+        docs/authoring docs/add_a_task docs/research docs/experts docs/recording docs/datasets docs/curation
+        docs/training docs/training_policies docs/recipes docs/loop docs/suites docs/machines docs/comparing
+        docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients
+        docs/api examples/index""",
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
     "Results": """docs/results/README docs/results/findings docs/results/reproductions docs/results/trainings
