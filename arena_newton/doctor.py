@@ -22,12 +22,12 @@ from arena_newton.files.sandboxed_load import faults
 __all__ = ["Finding", "examine", "examine_extras", "main", "versions"]
 
 USAGE = """usage: arena-newton doctor
-       arena-newton doctor --tracker NAME [--checkpoint PATH]
+       arena-newton doctor --tracker NAME [--checkpoint PATH] [--stand]
        arena-newton doctor --policy SPEC [--task TASK]
 
 Examines packages, extras, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
 With --tracker or --policy it tries what the interface promises on one of them, a package's own included; these are
-short for `trackers check` and `policies check`.
+short for `trackers check` and `policies check`. With --stand the tracker also stands and turns for two seconds.
 Exit code 0: a run can start, every promise is kept; 1: a problem must be solved first; 2: bad input."""
 _REQUIRED = {
     "newton": "physics, scenes and cameras",
@@ -239,9 +239,9 @@ def _scenes() -> list[Finding]:
     findings = []
     for path in (root / "g1" / "g1.usda", *(spec.layer for spec in tasks.specs())):
         if not path.is_file():
-            name = path.relative_to(root) if path.is_relative_to(root) else path
+            shown = path.relative_to(root) if path.is_relative_to(root) else path
             advice = "install again, or run `python -m scene_builders` in a checkout"
-            findings.append(Finding("scenes", f"{name} is missing", "bad", advice))
+            findings.append(Finding("scenes", f"{shown} is missing", "bad", advice))
     for name in {*tasks.names()} - {spec.name for spec in tasks.specs()}:
         try:
             tasks.get(name)

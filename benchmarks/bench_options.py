@@ -11,6 +11,7 @@ __all__ = [
     "CameraBenchOptions",
     "DatasetBenchOptions",
     "ForgeryOptions",
+    "GradientBenchOptions",
     "PeerOptions",
     "PlainBenchOptions",
     "PolicyBenchOptions",
@@ -182,3 +183,17 @@ class ForgeryOptions(PlainBenchOptions):
     """Honest folder of a run on engine mujoco; copies are forged."""
     policy: str | None = None
     """Policy of the folder, to be asked again."""
+
+
+@dataclass(frozen=True)
+class GradientBenchOptions(PlainBenchOptions):
+    """Compare exact slopes of engine mujoco with finite differences, in states of the experts' episodes."""
+
+    tasks: Several[str] = ()
+    """Tasks; all that have an expert when none are named."""
+    trackers: tuple[str, ...] = ("twist2", "sonic")
+    """Trackers, whose drives differ."""
+    states: int = field(default=20, metadata=bounds(2, 10_000))
+    """States of each task and tracker."""
+    loops: Several[str] = ("vis_navi", "sit_sofa")
+    """Tasks of the closed loops: the experts walk, and sit down."""

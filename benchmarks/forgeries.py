@@ -28,7 +28,7 @@ from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.run import run as evaluate
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.folders.run_folder import stored_options
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE
 from arena_newton.eval.reports import report

@@ -17,6 +17,7 @@ MODULES = (
     "arena_newton.rules.rule_types",
     "arena_newton.robot.canonical",
     "arena_newton.eval.plan.episode_plan",
+    "arena_newton.eval.play.factories",
     "arena_newton.differentiable",
     "arena_newton.testing",
     "arena_newton.data.recording.episode",

@@ -16,7 +16,7 @@ from arena_newton.cli.command_table import HELP, CommandRow, call, overview
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["COMMANDS", "main"]
 

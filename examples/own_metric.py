@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 
 

@@ -15,7 +15,7 @@ import torch
 
 from arena_newton import ArenaEnv
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.interfaces import Observation
 from arena_newton.robot.canonical import STATE
 

@@ -24,5 +24,5 @@ def wait_for(check, what, seconds=PLENTY):
     while not (found := check()):
         if time.monotonic() > end:
             pytest.fail(f"no {what} after {seconds:.0f} s", pytrace=False)
-        time.sleep(0.02)
+        time.sleep(0.05)
     return found

@@ -17,7 +17,8 @@ from packaging.requirements import Requirement
 from arena_newton import tasks
 from arena_newton.eval.__main__ import COMMANDS
 from arena_newton.eval.records.identity import UNHASHED
-from arena_newton.rules.modes import BUILT_IN, HELD_OUT
+from arena_newton.eval.tables.paper_numbers import PAPER_MODES
+from arena_newton.rules.modes import HELD_OUT
 from arena_newton.trackers.interface import MODULES
 from tests.import_graph import (
     INNER,
@@ -75,7 +76,7 @@ ANY = {
 """Files of arena_newton, eval and policies with `Any` in signatures, and why."""
 LISTED = {
     "task": (tasks.PAPER, {"arena_newton/tasks/__init__.py"}, 5),
-    "mode": (tuple(mode for mode in BUILT_IN if mode not in HELD_OUT), {"arena_newton/rules/modes.py"}, 2),
+    "mode": (PAPER_MODES, {"arena_newton/rules/modes.py"}, 2),
     "held-out look": (HELD_OUT, {"arena_newton/rules/modes.py", "scene_builders/patterns.py"}, 2),
     "tracker": (tuple(MODULES), {"trackers/interface.py"}, 3),
     "channel of motion commands": (
@@ -353,13 +354,14 @@ def test_what_no_run_is_known_by_moves_nothing():
         return {room for room in rooms if f"{name}.".startswith(f"{room}.")}
 
     allowed = {f"{PACKAGE}.eval.{room}" for room in ("records", "folders", "reports", "statistics")}
+    commands = {f"{PACKAGE}.trackers.{name}" for name in ("evaluate", "tracker_check")}
     found = []
     for edge in [*edges(), *imports(known(), checking=True)]:
         file = known()[edge.source].path
         if unhashed(edge.source) or file.name == "__main__.py" or edge.source.startswith(OUTSIDE):
             continue
-        # A command line by another name; no run imports it.
-        if edge.source != f"{PACKAGE}.trackers.evaluate" and (reached := unhashed(edge.target) - {f"{PACKAGE}.pages"}):
+        # Command lines by other names; no run imports them.
+        if edge.source not in commands and (reached := unhashed(edge.target) - {f"{PACKAGE}.pages"}):
             if part_of(edge.source, f"{PACKAGE}.eval") not in ("plan", "play") or not reached <= allowed:
                 found.append(f"{place(known()[edge.source], edge.line)}: imports {edge.target}")
     report(found)

@@ -262,7 +262,7 @@ class SonicFrontEnd(FrontEnd):
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
         self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, width=8, device=self.device)
         self._rot6d = Quadratic(ROT6D, IDENTITY_6D, device=self.device)
-        at = slices(self.variant.layout | PROPRIOCEPTION_LAYOUT)
+        at = slices({**self.variant.layout, **PROPRIOCEPTION_LAYOUT})
         if self.lookahead:
             self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], width=8, device=self.device)
             self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)

@@ -5,7 +5,15 @@
 
 from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state
 from arena_newton.differentiable.engine_step import EngineState, EngineStep
-from arena_newton.differentiable.estimates import Differences, Played, Reach, central_differences, play, reach
+from arena_newton.differentiable.estimates import (
+    Differences,
+    Played,
+    Reach,
+    central_differences,
+    cross_entropy,
+    play,
+    reach,
+)
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 from arena_newton.differentiable.soft_onset import soft_onset
@@ -22,6 +30,7 @@ __all__ = [
     "ball_flight",
     "central_differences",
     "closed_loop",
+    "cross_entropy",
     "play",
     "reach",
     "reference_step",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -40,13 +41,15 @@ class EngineStep:
     which the engine was.
     """
 
-    def __init__(self, physics: Physics, parameters: Sequence[str] = ()):
+    def __init__(self, physics: Physics, parameters: Sequence[str] = (), *, converged: bool = False):
         """Copy the models of the worlds.
 
         Args:
             physics: Worlds of engine `mujoco`; they are read, never stepped.
             parameters: Factors of the model that a tick takes: `mass` (with inertia), `friction`, `kp`, `kd` scale
                 those of all bodies, geoms or drives, `mass:PRIM` and so on those at or under a prim.
+            converged: Let the solver go on until nothing changes, for finite differences: the engine's own stops at a
+                tolerance, next to where it stopped in the tick before, and so ignores small changes.
 
         Raises:
             InputError: The engine, its model or a parameter is of a kind that has no gradient here.
@@ -58,6 +61,10 @@ class EngineStep:
         models = list(physics.models) if len(physics.models) > 1 else [physics.mj_model] * physics.worlds
         for model in models:
             check(model)
+        if converged:
+            models = [copy.copy(model) for model in models]
+            for model in models:
+                model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 100
         self._worlds = [ImplicitWorld(model, physics.scene, physics.rate.substeps, parts) for model in models]
         self._pool = ThreadPoolExecutor(physics.threads)
 
@@ -79,10 +86,12 @@ class EngineStep:
             factors: Factors of the model in the order of `parameters`, 1 = as built, shape [worlds, parameters].
 
         Raises:
-            InputError: A tensor of another shape.
+            InputError: A tensor of another shape, or a factor that is not above 0.
         """
         if factors is None:
             factors = torch.ones(len(self._worlds), len(self.parameters))
+        if (factors <= 0.0).any():
+            raise InputError("EngineStep: a factor of the model is not above 0")
         given = (*state, targets, factors)
         model = self._physics.mj_model
         widths = model.nq, model.nv, state.carried.shape[-1], model.nu, len(self.parameters)

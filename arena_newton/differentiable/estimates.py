@@ -6,7 +6,7 @@ it has parameters, all from one episode seed: the worlds then differ by what was
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -20,7 +20,7 @@ from arena_newton.robot.canonical import STAND_ACTION
 if TYPE_CHECKING:
     from arena_newton.env import ArenaEnv
 
-__all__ = ["Differences", "Played", "Reach", "central_differences", "play", "reach"]
+__all__ = ["Differences", "Played", "Reach", "central_differences", "cross_entropy", "play", "reach"]
 
 
 class Differences(NamedTuple):
@@ -110,6 +110,32 @@ def reach(
     near, far = (central_differences(function, at, scale, rows=rows).gradient for scale in scales)
     agree = [(one - slope).abs() <= tolerance * torch.maximum(one.abs(), slope.abs()) for one in (near, far)]
     return Reach(slope, near, far, agree[0] & agree[1])
+
+
+def cross_entropy(
+    function: Callable[[torch.Tensor], torch.Tensor], mean: torch.Tensor, width: torch.Tensor | float, *, draws: int
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Minimise one number without gradients by the cross-entropy method: what a descent along a gradient has to beat.
+
+    Each generation is drawn from independent normal distributions, which then take mean and spread of its best sixth
+    (Rubinstein, R. and Kroese, D. (2004): The Cross-Entropy Method).
+
+    Args:
+        function: (points [draws, ...]) → values [draws].
+        mean: Mean of the first generation, any shape.
+        width: Its standard deviation, one number or one per parameter.
+        draws: Points of a generation.
+
+    Yields:
+        The mean of the best of a generation, and the values of all, without end.
+    """
+    while True:
+        points = mean + width * torch.randn(draws, *mean.shape, dtype=mean.dtype, device=mean.device)
+        with torch.no_grad():
+            values = function(points)
+        best = points[values.argsort()[: max(2, draws // 6)]]
+        mean, width = best.mean(0), best.std(0)
+        yield mean, values
 
 
 class Played(NamedTuple):

@@ -145,6 +145,7 @@ class ImplicitWorld:
         self._data = self.data = mujoco.MjData(model)
         self._scaled: dict[int, bytes] = {}
         """Factors that each of the two models has now."""
+        self._spare = mujoco.MjData(model)
         joints = model.actuator_trnid[:, 0]
         self._dof, self._qadr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
         bound = np.tile((-np.inf, np.inf), (model.nv, 1))
@@ -196,15 +197,22 @@ class ImplicitWorld:
             steps.append(_Substep(q, v, d.qacc.copy(), d.qvel - v))
         self._scale(self._inverse, given.factors)
         at_q, at_v, at_targets = self._tangent(d.qpos, qpos), qvel, np.zeros_like(given.targets)
+        at_gains = np.zeros((2, len(at_targets)))
         weighed: list[tuple[_Substep, np.ndarray, np.ndarray]] = []
         for step in reversed(steps):
-            at_q, at_v, at_drives, *weights = self._step_adjoint(step, given.targets, at_q, at_v)
+            at_q, at_v, at_drives, by_gains, *weights = self._step_adjoint(step, given.targets, at_q, at_v)
             at_targets += at_drives
+            at_gains += by_gains
             weighed.append((step, weights[0], weights[1]))
-        moved = given.factors + _FACTOR_STEP * np.eye(len(given.factors))
-        base = self._residuals(weighed, given.targets, given.factors) if self._parameters else 0.0
-        slopes = [(self._residuals(weighed, given.targets, factors) - base) / _FACTOR_STEP for factors in moved]
-        at_factors = np.array(slopes, dtype=np.float64)
+        at_factors = np.empty_like(given.factors)
+        base = self._inertial(weighed, given.factors) if self._parameters else 0.0
+        for k, ((field, index), *_) in enumerate(self._parameters):
+            if field == "actuator_biasprm":
+                at_factors[k] = at_gains[index[1] - 1, index[0]].sum() / given.factors[k]
+                continue
+            moved = given.factors.copy()
+            moved[k] += _FACTOR_STEP
+            at_factors[k] = (self._inertial(weighed, moved) - base) / _FACTOR_STEP
         return Inputs(self._ambient(given.qpos, at_q), at_v, np.zeros_like(given.carried), at_targets, at_factors)
 
     def poses(self, qpos: np.ndarray, carried: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -248,7 +256,7 @@ class ImplicitWorld:
             for field, index in parameter:
                 getattr(model, field)[index] *= factor
         if "body_mass" in self._fields:
-            mujoco.mj_setConst(model, mujoco.MjData(model))
+            mujoco.mj_setConst(model, self._spare)
 
     def _damping(self, model: mujoco.MjModel) -> np.ndarray:
         """Diagonal of the integrator's D; the engine keeps a drive's part where its torque is at the limit."""
@@ -271,8 +279,11 @@ class ImplicitWorld:
 
     def _step_adjoint(
         self, step: _Substep, targets: np.ndarray, at_q: np.ndarray, at_v: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Gradients to position, velocity and targets before a step, and the weights of its two equations."""
+    ) -> tuple[np.ndarray, ...]:
+        """Gradients to position, velocity, targets and gains at a step, and the weights of its two equations.
+
+        Those to gains are times the gains: of stiffness and of damping, shape [2, nu].
+        """
         m, d = self._inverse, self._data
         h, nv = m.opt.timestep, m.nv
         at_v, at_q = at_v + h * at_q, at_q.copy()
@@ -286,19 +297,22 @@ class ImplicitWorld:
         d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
         mujoco.mj_inverse(m, d)
         mass, jacobian, (rows, columns) = self._mass_matrix(), self._jacobian(), self._rate_at
-        y = h * np.linalg.solve(mass - h * np.diag(self._damping(m)), at_v)
-        stiffness = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0)
-        w = np.linalg.solve(mass + jacobian.T @ (stiffness[:, None] * jacobian), mass @ y)
-        damped = jacobian.T @ (stiffness * d.efc_KBIP[:, 1] * (jacobian @ w))
+        y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
+        stiffness, constrained = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0), np.zeros_like(mass)
+        mujoco.mju_sqrMatTD(constrained, jacobian, stiffness)
+        w = _solved(mass + constrained, mass @ y)
+        resisted = jacobian.T @ (stiffness * d.efc_KBIP[:, 1] * (jacobian @ w))
         mujoco.mj_implicit(m, d)  # leaves qDeriv, and takes a step that nobody needs
-        at_v = at_v - damped + np.bincount(columns, d.qDeriv * w[rows], nv)
+        at_v = at_v - resisted + np.bincount(columns, d.qDeriv * w[rows], nv)
         at_q = at_q + self._by_position(step, y, w, jacobian != 0.0)
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
-        gain, bias, drive = m.actuator_gainprm, m.actuator_biasprm, driven[self._dof]
+        gain, bias, drive = m.actuator_gainprm[:, 0], m.actuator_biasprm, driven[self._dof]
         at_q += np.bincount(self._dof, bias[:, 1] * drive, nv)
         at_v += np.bincount(self._dof, bias[:, 2] * drive, nv)
-        return at_q, at_v, gain[:, 0] * drive, y, w
+        stiff = drive * (gain * targets + bias[:, 1] * step.q[self._qadr])
+        damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[self._dof])
+        return at_q, at_v, gain * drive, np.stack([stiff, damped]), y, w
 
     def _jacobian(self) -> np.ndarray:
         """Jacobian of the constraints, shape [constraints, nv]."""
@@ -307,7 +321,7 @@ class ImplicitWorld:
         if self._sparse:
             full[np.repeat(np.arange(d.nefc), d.efc_J_rownnz), d.efc_J_colind] = d.efc_J
         else:
-            full.flat = d.efc_J
+            full[:] = d.efc_J.reshape(full.shape)
         return full
 
     def _by_position(self, step: _Substep, y: np.ndarray, w: np.ndarray, moves: np.ndarray) -> np.ndarray:
@@ -345,20 +359,17 @@ class ImplicitWorld:
             found[at] = (groups[at] * (sums[row] - sums[0])).sum(axis=1) / _STEP
         return found
 
-    def _residuals(
-        self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], targets: np.ndarray, factors: np.ndarray
-    ) -> float:
-        """Weighted sum of what integrator and solver equate to 0, whose slope in a factor is the number's."""
-        m, d = self._inverse, self._data
+    def _inertial(self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], factors: np.ndarray) -> float:
+        """Weighted sum of what integrator and solver equate to 0, drives aside; a gradient is its slope in a factor."""
+        m, d, product = self._inverse, self._data, np.empty(self._model.nv)
         m.opt.disableflags = self._flags
         self._scale(m, factors)
         total = 0.0
         for step, y, w in weighed:
             d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
             mujoco.mj_inverse(m, d)
-            torque = np.clip(self._torque(m, step, targets), self._low, self._high)
-            inertial = self._mass_matrix() @ (step.a - step.change / m.opt.timestep) + self._damping(m) * step.change
-            total += float(y @ inertial + w @ (torque - d.qfrc_inverse))
+            mujoco.mj_mulM(m, d, product, step.a - step.change / m.opt.timestep)
+            total += float(y @ product - w @ d.qfrc_inverse)
         return total
 
     def _tangent(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
@@ -383,3 +394,11 @@ class ImplicitWorld:
             quat = qpos[q : q + 4]
             found[..., q : q + 4] = turn * tangent[..., v : v + 3] @ (_AXES @ quat) / (quat @ quat)
         return found
+
+
+def _solved(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Solution of a positive definite system, in one thread: those of LAPACK wait for each other; overwrites matrix."""
+    found = np.empty_like(vector)
+    mujoco.mju_cholFactor(matrix, 0.0)
+    mujoco.mju_cholSolve(found, matrix, vector)
+    return found

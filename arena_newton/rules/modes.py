@@ -82,6 +82,11 @@ class Mode:
                 raise InputError(f"mode {self.name}: {name}: {high:g}, expected at most {MOST_LATENCY} ticks")
 
     @property
+    def ruled(self) -> bool:
+        """True if the hash of a rule set holds all its ranges."""
+        return self.name in BUILT_IN and not self.dynamics
+
+    @property
     def looks(self) -> bool:
         """True if its pictures differ from those of base mode."""
         return self.scene != "base" or self.light is not None
@@ -104,34 +109,35 @@ class Mode:
 
 
 BUILT_IN = {
-    mode.name: mode
-    for mode in (
-        Mode(name="base", sentence="changes nothing"),
-        Mode(name="execution", sentence="objects start in wider ranges", placements=lambda rule: rule.execution),
-        Mode(name="semantic", sentence="textures, drawn shapes or decor differ", scene="semantic"),
-        Mode(name="semantic-2", sentence="a held-out look: others than those of semantic mode", scene="layer"),
-        Mode(name="semantic-3", sentence="another held-out look", scene="layer"),
-        Mode(
-            name="visual",
-            sentence="a distant light of drawn direction, intensity and colour",
-            light=lambda rules: rules.visual_light,
-        ),
-        Mode(
-            name=DYNAMICS,
-            sentence="friction, masses, gains and latencies differ, and the robot is pushed once",
-            dynamics={
-                "friction": (0.3, 1.2),
-                "robot_mass": (0.8, 1.2),
-                "object_mass": (0.5, 1.5),
-                "gains": (0.8, 1.2),
-                "state_latency": (0, 1),
-                "action_latency": (0, 1),
-                "push": (0.0, 1.0),
-                "push_heading": (-math.pi, math.pi),
-                "push_time": (0.02, 0.25),
-            },
-        ),
-    )
+    "base": Mode(name="base", sentence="changes nothing"),
+    "execution": Mode(
+        name="execution", sentence="objects start in wider ranges", placements=lambda rule: rule.execution
+    ),
+    "semantic": Mode(name="semantic", sentence="textures, drawn shapes or decor differ", scene="semantic"),
+    "semantic-2": Mode(
+        name="semantic-2", sentence="a held-out look: others than those of semantic mode", scene="layer"
+    ),
+    "semantic-3": Mode(name="semantic-3", sentence="another held-out look", scene="layer"),
+    "visual": Mode(
+        name="visual",
+        sentence="a distant light of drawn direction, intensity and colour",
+        light=lambda rules: rules.visual_light,
+    ),
+    DYNAMICS: Mode(
+        name=DYNAMICS,
+        sentence="friction, masses, gains and latencies differ, and the robot is pushed once",
+        dynamics={
+            "friction": (0.3, 1.2),
+            "robot_mass": (0.8, 1.2),
+            "object_mass": (0.5, 1.5),
+            "gains": (0.8, 1.2),
+            "state_latency": (0, 1),
+            "action_latency": (0, 1),
+            "push": (0.0, 1.0),
+            "push_heading": (-math.pi, math.pi),
+            "push_time": (0.02, 0.25),
+        },
+    ),
 }
 """The paper's four test modes, base, execution, semantic and visual; the held-out looks; and dynamics."""
 HELD_OUT = tuple(mode.name for mode in BUILT_IN.values() if mode.scene == "layer")

@@ -68,8 +68,8 @@ def slow(scene: Scene, prim: str, limit: float) -> Condition:
 
 def standing(scene: Scene, rules: RuleSet) -> tuple[Condition, ...]:
     """The robot stands, as a rule set says."""
-    pelvis = links(scene, "pelvis")
-    return above(*pelvis, rules.standing.min_root_z), Condition("upright", rules.standing.min_up, pelvis)
+    (pelvis,) = links(scene, "pelvis")
+    return above(pelvis, rules.standing.min_root_z), Condition("upright", rules.standing.min_up, (pelvis,))
 
 
 def origin(scene: Scene, prim: str) -> BodyFrame:
@@ -296,5 +296,14 @@ class ConditionsJudge(Judge):
         """See `Judge.decide`."""
         from arena_newton.kernels.rules.predicates import launch_conditions
 
-        state = physics.xpos, physics.xquat, physics.qpos, physics.qvel, physics.latch_locked
-        launch_conditions(*state, **self._success, ticks=self._ticks, counter=self._held, **self.outputs())
+        launch_conditions(
+            physics.xpos,
+            physics.xquat,
+            physics.qpos,
+            physics.qvel,
+            physics.latch_locked,
+            **self._success,
+            ticks=self._ticks,
+            counter=self._held,
+            **self.outputs(),
+        )

@@ -30,7 +30,8 @@ def semantic_notes(named: Iterable[str]) -> list[str]:
             "decor than semantic mode, and other clutter in P&PBox; nothing else that moves or collides differs from "
             "base mode. They count as unseen for policies that were neither trained nor tuned on them."
         )
-    return found
+    others = [modes.get(name) for name in modes.names() if name in played]
+    return found + [f"{mode.name}: none of the paper's modes: {mode.sentence}." for mode in others if not mode.ruled]
 
 
 def semantic_note() -> str:

@@ -19,7 +19,8 @@ from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.options import Batch, Chunks, Conditions, Remote, RunOptions, Stepping, flags_of
-from arena_newton.eval.play.run import Factories, check_parts, make_env
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import check_parts, make_env
 from arena_newton.eval.play.run_flow import groups
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.identity import differing_key

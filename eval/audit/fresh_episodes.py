@@ -11,7 +11,8 @@ from arena_newton.eval.audit.folder_audit import Audit
 from arena_newton.eval.folders.run_folder import stored_options
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import Chunks
-from arena_newton.eval.play.run import Factories, check_parts
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import check_parts
 from arena_newton.eval.play.run_flow import Group, groups
 from arena_newton.eval.records.journal import JOURNAL_FILE
 from arena_newton.eval.statistics.rate_tests import UnpairedCounts, rate_test

@@ -18,14 +18,14 @@ from arena_newton.interfaces import Physics
 from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.robot.g1 import PhysicsRate
 
-__all__ = ["RATES", "throughput_figures", "tick_figures", "tick_times"]
+__all__ = ["RATES", "as_before", "throughput_figures", "tick_figures", "tick_times"]
 
 RATES = {"1 ms x 20": PhysicsRate(dt=0.001, substeps=20), "5 ms x 4": PhysicsRate(dt=0.005, substeps=4)}
 """The two rates of the physics at which ticks are measured, whatever rate the weights were trained at."""
 
 
 @contextlib.contextmanager
-def _as_before(physics: Physics) -> Iterator[None]:
+def as_before(physics: Physics) -> Iterator[None]:
     """Put the physics back into the state it had, so that the bare steps start where the full ticks do."""
     kept = physics.snapshot()
     yield
@@ -65,11 +65,11 @@ def tick_times(
             env.physics.mj_step_only()
 
     ticks(env.startup_ticks + 10)
-    with _as_before(env.physics):
+    with as_before(env.physics):
         bare(2)
     pairs = []
     for _ in range(rounds):
-        with _as_before(env.physics):
+        with as_before(env.physics):
             alone = seconds_of(partial(bare, count)) / count
         pairs.append((seconds_of(partial(ticks, count)) / count, alone))
         ended = np.flatnonzero(status)

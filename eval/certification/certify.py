@@ -42,7 +42,7 @@ from arena_newton.eval.certification.jobs import command_line, play_ahead
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, Body
 from arena_newton.eval.plan.config import plain_facts
 from arena_newton.eval.plan.episode_plan import MAX_EPISODES
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.identity import code_hash
 from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.reports.progress import duration

@@ -21,6 +21,7 @@ from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.identity import PACKAGE, config_hash, hash_paths, package_files
 from arena_newton.eval.records.journal import ContradictionError, EpisodeRecord, write_atomic
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
@@ -84,7 +85,7 @@ class Context:
     """Tasks with an expert, in the order of the registry."""
     say: Callable[[str], None]
     """Prints a line about what is going on."""
-    factories: run.Factories = field(default_factory=run.Factories)
+    factories: Factories = field(default_factory=Factories)
     bodies: Mapping[str, Body] = field(default_factory=lambda: BODIES)
 
     @property

@@ -13,7 +13,7 @@ from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.files.text import counted
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
     from arena_newton.eval.studies.placement_axes import Axis
     from arena_newton.eval.studies.placement_files import PointTally
     from arena_newton.eval.studies.worst_placement import Point

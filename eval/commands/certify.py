@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from arena_newton.eval.certification.certify_options import CertifyOptions
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["QUICK_JOBS", "run"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["BundleOptions", "LeaderboardOptions", "bundle", "run"]
 

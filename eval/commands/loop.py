@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from arena_newton.eval.loop.loop_options import LoopOptions
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["run"]
 

@@ -8,7 +8,7 @@ from arena_newton.eval.commands.run import run as evaluate
 from arena_newton.eval.plan.options import RecordOptions
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["run"]
 

@@ -12,7 +12,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.commands.run import run as evaluate
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["ReportOptions", "run"]
 

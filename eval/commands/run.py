@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from arena_newton.eval.plan.options import RunOptions, is_quick
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["run"]
 

@@ -17,7 +17,7 @@ from arena_newton.files.text import counted
 
 if TYPE_CHECKING:
     from arena_newton.eval.plan.config import RunConfig
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
     from arena_newton.eval.studies.placement_axes import Axis
     from arena_newton.eval.studies.placement_files import PointTally
 
@@ -98,7 +98,7 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
 
 def _adjoint(options: SensitivityOptions, config: RunConfig, axes: Sequence[Axis], factories: Factories | None) -> int:
     """Write and print the slopes of one episode."""
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
     from arena_newton.eval.studies.adjoint_slopes import play_slopes
     from arena_newton.eval.studies.placed_play import PlacedWorlds
     from arena_newton.eval.studies.placement_files import study_folder

@@ -28,7 +28,7 @@ from arena_newton.files.text import plain
 from arena_newton.trackers import shipped_weights
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["CheckedEntry", "check_entry"]
 

@@ -26,7 +26,8 @@ from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, c
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
 from arena_newton.eval.plan.options import RecordOptions, RunOptions
-from arena_newton.eval.play.run import Factories, execute
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import execute
 from arena_newton.eval.records.document import read_document
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES

@@ -38,7 +38,7 @@ from arena_newton.eval.plan.config import RunConfig, plain_facts, recorded_camer
 from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RecordOptions, RunOptions, Workers, flags_of
 from arena_newton.eval.play import recording
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.identity import differing_key
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress

@@ -19,10 +19,8 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 import warp as wp
 
-from arena_newton import policies, trackers
 from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.cli.quiet import quiet_warp
-from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.recordings import ActionRecorder
 from arena_newton.eval.folders.run_folder import PROCESSOR, ResultsFolder, actions_folder, iso, shown_by
@@ -30,6 +28,7 @@ from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.flag_checks import DRIVES
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run_flow import (
     Group,
     RunStopped,
@@ -59,15 +58,12 @@ from arena_newton.policies.label_reader import read_by
 from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
-from arena_newton.trackers.base import Tracker
-from arena_newton.usd_scenes import validate
 
 if TYPE_CHECKING:
     from arena_newton.data.recording.demonstration import DemonstrationRecorder
     from arena_newton.pictures.recorder import EpisodeRecorder
 
 __all__ = [
-    "Factories",
     "ProgressSink",
     "RunPlayer",
     "RunStopped",
@@ -75,26 +71,6 @@ __all__ = [
     "execute",
     "make_env",
 ]
-
-
-def _no_recorders(env: World) -> Sequence[Recorder]:
-    return ()
-
-
-@dataclass(frozen=True)
-class Factories:
-    """Constructors of a run's parts, for a program that puts its own in (docs/research.md).
-
-    Other processes (`--jobs`) import them by module and name, so there they must not be of the program's main module.
-    """
-
-    env: Callable[..., World] = ArenaEnv
-    tracker: Callable[[str, Path | None], Tracker] = trackers.get
-    policy: Callable[..., Policy] = policies.get
-    check_variant: Callable[[Path, str], None] = validate.check
-    """Raises InputError for a file that is not a scene of the task."""
-    recorders: Callable[[World], Sequence[Recorder]] = _no_recorders
-    """Recorders of an environment, made once for it; their metrics are in the journal (`EpisodeResult.extra`)."""
 
 
 def execute(folder: ResultsFolder, factories: Factories | None = None) -> int:

@@ -233,7 +233,7 @@ def foreign_task(spec: TaskSpec) -> JsonObject:
 def mode_facts(name: str, rules: RuleSet, tasks: Collection[str]) -> JsonObject:
     """Hashes of a mode's ranges for some tasks, and of the package of its functions, unless the rules hold them all."""
     mode = all_modes.get(name)
-    if name in all_modes.BUILT_IN and not mode.dynamics:
+    if mode.ruled:
         return {}
     codes = {code for part in (mode.placements, mode.light) if part and (code := own_code(part)) is not None}
     return {"ranges": mode.hash_for(rules, tasks)} | ({"code": config_hash(sorted(codes))} if codes else {})

@@ -14,7 +14,8 @@ import torch
 from arena_newton.differentiable import EngineState, EngineStep, closed_loop, reach
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
-from arena_newton.eval.play.run import Factories, make_env
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import make_env
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.studies.placed_play import PlacedWorlds
 from arena_newton.eval.studies.placement_files import PlacedStudy, summary_json
@@ -124,8 +125,9 @@ def _slopes(moved: _Moved, ticks: int, scales: Sequence[float], grid: Sequence[f
     env, axes, parameters = moved.env, moved.worlds.axes, moved.parameters
     start = moved.start(moved.at)
     qpos = start.qpos.clone().requires_grad_()
-    begun, run = start._replace(qpos=qpos), {"parameters": parameters, "checkpoint": CHECKPOINT}
-    rolled = closed_loop(env, moved.worlds.policy, [moved.seed], ticks, start=begun, **run)
+    begun = start._replace(qpos=qpos)
+    policy, seeds = moved.worlds.policy, [moved.seed]
+    rolled = closed_loop(env, policy, seeds, ticks, parameters=parameters, start=begun, checkpoint=CHECKPOINT)
     at_qpos, at_factors = torch.autograd.grad(rolled.margin[-1, 0], (qpos, rolled.factors))
     plan = rolled.actions.detach().transpose(0, 1)
     exact: list[float | None] = []
@@ -138,9 +140,8 @@ def _slopes(moved: _Moved, ticks: int, scales: Sequence[float], grid: Sequence[f
     def margins(points: torch.Tensor) -> torch.Tensor:
         values, factors = points[0].tensor_split([len(axes)])
         begin = moved.start(values.tolist())
-        return closed_loop(
-            env, plan, [moved.seed], ticks, parameters=parameters, factors=factors[None], start=begin
-        ).margin[-1]
+        found = closed_loop(env, plan, seeds, ticks, parameters=parameters, factors=factors[None], start=begin)
+        return found.margin[-1]
 
     at = torch.tensor([*moved.at, *[1.0] * len(parameters)], dtype=torch.float64)
     known = torch.tensor([math.nan if one is None else one for one in exact], dtype=torch.float64)

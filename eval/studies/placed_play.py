@@ -17,7 +17,8 @@ from arena_newton.errors import InputError
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.play.run import Factories, check_parts, make_env
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import check_parts, make_env
 from arena_newton.eval.studies.placement_axes import Axis, axes_of, chosen, moved
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.interfaces import EpisodeResult, Planned, World

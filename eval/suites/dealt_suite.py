@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run_flow import begun, reported
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import Progress

@@ -20,7 +20,8 @@ from arena_newton.eval.folders.run_folder import ResultsFolder, setting, timesta
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.options import Workers, flags_of
 from arena_newton.eval.play.env_cache import EnvCache
-from arena_newton.eval.play.run import Factories, RunStopped, execute
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import RunStopped, execute
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.eval.reports.progress import duration

@@ -18,7 +18,7 @@ from arena_newton.eval.workers.messages import Broke, EpisodeBatch, Event, Node,
 
 if TYPE_CHECKING:
     from arena_newton.eval.plan.config import RunConfig
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
     from arena_newton.policies.base import Policy
 
 __all__ = ["EpisodeActor"]

@@ -20,7 +20,8 @@ from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig, plain_facts, resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.env_cache import EnvCache
-from arena_newton.eval.play.run import Factories, RunPlayer, RunStopped, check_parts
+from arena_newton.eval.play.factories import Factories
+from arena_newton.eval.play.run import RunPlayer, RunStopped, check_parts
 from arena_newton.eval.records.document import Document
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.eval.reports.progress import kernels_to_compile

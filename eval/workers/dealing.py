@@ -41,7 +41,7 @@ from arena_newton.files.text import counted, plain_text
 from arena_newton.robot.g1 import TICK
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 __all__ = ["DealtRun", "execute"]
 

@@ -30,7 +30,7 @@ from arena_newton.eval.workers.messages import Broke, Done, EpisodeBatch, Event,
 from arena_newton.files.text import counted, plain_text
 
 if TYPE_CHECKING:
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
 
 __all__ = ["Assignment", "Job", "Lost", "Worker", "WorkerPool", "backend_of"]

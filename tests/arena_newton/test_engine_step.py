@@ -1,6 +1,5 @@
 """Gradients through a tick of engine `mujoco`: against differences, in every scene, and what has none."""
 
-import copy
 import re
 from types import SimpleNamespace
 
@@ -38,13 +37,6 @@ def stood(built, ticks=15, **options):
     return physics
 
 
-def settled(built, **options):
-    """The same with a solver that stops at no tolerance: differences through the engine's warm start are wrong."""
-    model = copy.copy(built.mj_model)
-    model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 100
-    return make_physics(built, RATE, "mujoco", models=[model], **options)
-
-
 def moved(model, qpos, direction):
     """Positions after a move along a tangent direction, shape [1, nq]."""
     row = qpos.numpy()[0].copy()
@@ -62,7 +54,7 @@ def test_a_tick_has_the_slopes_of_differences(task):
     """In every scene, slopes to positions, velocities and targets are those of centred differences, in contact."""
     built, rng = scene(task), np.random.default_rng(3)
     physics = stood(built)
-    model, exact, precise = physics.mj_model, EngineStep(physics), EngineStep(settled(built))
+    model, exact, precise = physics.mj_model, EngineStep(physics), EngineStep(physics, converged=True)
     state = exact.state()
     assert physics.data[0].ncon >= 4
     targets = physics.data[0].ctrl + 0.05 * rng.normal(size=(1, model.nu))
@@ -94,7 +86,7 @@ def test_factors_of_the_model_over_a_run():
     """Through five ticks, friction, masses and gains have the slopes of centred differences of the whole run."""
     built = scene("football")
     physics = stood(built)
-    exact, precise = EngineStep(physics, PARAMETERS), EngineStep(settled(built), PARAMETERS)
+    exact, precise = EngineStep(physics, PARAMETERS), EngineStep(physics, PARAMETERS, converged=True)
     start, targets = exact.state(), torch.from_numpy(physics.data[0].ctrl.copy())[None]
     targets[0, built.robot.joint_ctrl[:6]] += 0.2
 
@@ -155,6 +147,7 @@ IMPLICIT = "<option integrator='implicitfast'/>"
 TENDON = "<tendon><fixed><joint joint='j' coef='1'/></fixed></tendon>"
 MOTOR = "<actuator><motor joint='j'/></actuator>"
 SLOW = "<actuator><position joint='j' timeconst='.1'/></actuator>"
+ROUND = "<option integrator='implicitfast' cone='elliptic'/>"
 AIR = "<option integrator='implicitfast' density='1.2'/>"
 
 
@@ -166,6 +159,7 @@ AIR = "<option integrator='implicitfast' density='1.2'/>"
         (IMPLICIT + JOINT + MOTOR, "actuator 0, not a joint's position drive"),
         (IMPLICIT + JOINT + SLOW, "an activation state"),
         (AIR + JOINT + DRIVE, "a fluid"),
+        (ROUND + JOINT + DRIVE, "elliptic friction cones"),
     ],
 )
 def test_a_model_with_parts_that_have_no_gradient(parts, words):
@@ -176,7 +170,7 @@ def test_a_model_with_parts_that_have_no_gradient(parts, words):
 
 
 def test_what_else_has_no_gradient():
-    """Engine `warp`, unknown parameters and prims, forces from outside and other shapes are refused by name."""
+    """Engine `warp`, unknown parameters and prims, outer forces, other shapes and factors are refused by name."""
     built = scene("football")
     physics = make_physics(built, RATE, "mujoco")
     with pytest.raises(InputError, match="engine warp has no gradient here: use engine mujoco"):
@@ -190,6 +184,8 @@ def test_what_else_has_no_gradient():
     state = step.state()
     with pytest.raises(InputError, match=r"targets of shape \[1, 29\], not \[1, 43\]"):
         step(state, torch.zeros(1, 29))
+    with pytest.raises(InputError, match="a factor of the model is not above 0"):
+        EngineStep(physics, ["kp"])(state, torch.zeros(1, 43), torch.zeros(1, 1))
     physics.external_force.assign(np.ones((1, physics.nbody, 6), np.float32))
     with pytest.raises(InputError, match="an external force acts on a body"):
         step.state()

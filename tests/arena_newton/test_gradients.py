@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from arena_newton.differentiable import (
     RollingBall,
     ball_flight,
     central_differences,
+    cross_entropy,
     play,
     reference_step,
 )
@@ -155,6 +157,16 @@ def test_differences_of_a_known_function():
         assert found.value == pytest.approx(4.0)
 
 
+def test_the_cross_entropy_method_finds_a_minimum():
+    """The mean of its best moves to the minimum of a quadratic; every generation has as many draws as were asked."""
+    torch.manual_seed(0)
+    wanted = torch.tensor([0.3, -0.5], dtype=torch.float64)
+    search = cross_entropy(lambda points: (points - wanted).square().sum(1), 0.0 * wanted, 0.5, draws=60)
+    *_, (mean, values) = (next(search) for _ in range(12))
+    assert values.shape == (60,)
+    torch.testing.assert_close(mean, wanted, atol=1e-2, rtol=0.0)
+
+
 def test_a_kink_tells_itself():
     """`bend` is as large as the gradient's error if the slope changes within the step; elsewhere it is zero."""
     found = central_differences(lambda points: points.abs().sum(1), torch.tensor([0.0, 1.0]), 0.1, rows=5)
@@ -218,6 +230,39 @@ def test_the_engines_solver_has_no_adjoints():
 
     for name in ("collision_driver", "constraint", "forward", "passive", "smooth", "solver"):
         assert wp.get_module(f"mujoco_warp._src.{name}").options["enable_backward"] is False
+
+
+@pytest.mark.release
+def test_newtons_featherstone_has_the_slope_of_the_wrong_sign():
+    """A pendulum that a constant force pushes, without contact: when its slope is right, the documentation must change.
+
+    The speed after a step is −h L f cos(q) / I. The step by Newton's adjoint has minus its slope, because the kernel
+    `eval_rigid_tau` writes over the force that it reads, and runs backward from what it wrote.
+    """
+    angle, length, force, mass, inertia, step = 0.3, 0.5, 200.0, 1.0, 0.1, 0.01
+    builder = newton.ModelBuilder(gravity=wp.vec3(0.0, 0.0, 0.0))
+    diagonal = wp.mat33(np.eye(3, dtype=np.float32) * inertia)
+    link = builder.add_link(mass=mass, inertia=diagonal, com=wp.vec3(0.0, 0.0, -length))
+    builder.add_articulation([builder.add_joint_revolute(-1, link, axis=newton.Axis.Y)])
+    model = builder.finalize(device="cpu", requires_grad=True)
+
+    def pushed(angle):
+        """State before a step and after it, and its tape."""
+        solver = newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
+        before, after, tape = model.state(requires_grad=True), model.state(requires_grad=True), wp.Tape()
+        before.joint_q.assign([angle])
+        before.body_f.assign(np.array([[force, 0, 0, 0, 0, 0]], np.float32))
+        with tape:
+            newton.eval_fk(model, before.joint_q, before.joint_qd, before)
+            solver.step(before, after, model.control(), None, step)
+        return before, after, tape
+
+    before, after, tape = pushed(angle)
+    tape.backward(grads={after.joint_qd: wp.ones(1, dtype=wp.float32, device="cpu")})
+    moved = [pushed(angle + shift)[1].joint_qd.numpy()[0] for shift in (-0.01, 0.01)]
+    slope = step * length * force * np.sin(angle) / (inertia + mass * length**2)
+    assert (moved[1] - moved[0]) / 0.02 == pytest.approx(slope, rel=1e-3)
+    assert before.joint_q.grad.numpy()[0] == pytest.approx(-slope, rel=1e-3), "mended: docs/gradients.md must say so"
 
 
 def test_worlds_differ_by_their_actions_alone():

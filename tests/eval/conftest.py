@@ -105,7 +105,7 @@ def parts():
     """Parts of runs in environments that all files share and whose episodes soon succeed."""
     from quick_worlds import QuickEnv
 
-    from arena_newton.eval.play.run import Factories
+    from arena_newton.eval.play.factories import Factories
 
     for made in keepers(QuickEnv):
         yield Factories(env=made)

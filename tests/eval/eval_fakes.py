@@ -15,7 +15,7 @@ import torch
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.interfaces import Chunk, EpisodeEvent, Observation, Recorder, Verdict
 from arena_newton.kernels import tick as codes
 from arena_newton.policies.base import Policy

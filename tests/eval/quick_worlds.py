@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from arena_newton.eval.play.env_cache import CachedEnv
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.kernels.tick import SUCCESS
 
 

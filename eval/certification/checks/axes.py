@@ -323,7 +323,7 @@ def _stand(context: Context, task: str, tracker: str) -> list[str]:
         still = key == "object_mass"  # where no object moves, its mass changes nothing
         if (tick is None and not still) or (key == "push" and tick != env.startup_ticks + PUSHED_AT):
             faults.append(f"{key} acts from tick {tick} on")
-    return faults
+    return [*dict.fromkeys(faults)]
 
 
 def _strays(

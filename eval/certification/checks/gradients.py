@@ -1,6 +1,6 @@
-"""Are gradients that are called exact those that differences estimate? Where both exist: conversion, margins, the ball.
+"""Are gradients that are called exact those that differences estimate? Conversion, ticks, margins, the ball.
 
-A tick of engine `mujoco` is compared in the tests, one of engine `warp` has no exact gradient (`docs/gradients.md`).
+A tick of engine `warp` has no exact gradient (`docs/gradients.md`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,15 @@ import torch
 import warp as wp
 
 from arena_newton import policies
-from arena_newton.differentiable import ReferenceState, RollingBall, ball_flight, central_differences, reference_step
+from arena_newton.differentiable import (
+    EngineState,
+    EngineStep,
+    ReferenceState,
+    RollingBall,
+    ball_flight,
+    central_differences,
+    reference_step,
+)
 from arena_newton.differentiable.kernel_gradients import recorded
 from arena_newton.eval.certification.checks.traces import world_of
 from arena_newton.eval.certification.context import Context
@@ -32,7 +40,7 @@ if TYPE_CHECKING:
     from arena_newton.files.stored_json import JsonObject
     from arena_newton.physics.batch import Physics
 
-__all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "agreement_of", "flight_slopes"]
+__all__ = ["CHECKS", "TOLERANCE", "Agreement", "Slopes", "TickSlopes", "agreement_of", "flight_slopes"]
 
 TOLERANCE = 0.0025
 """An exact slope may differ from its estimate by so much of it, or of the root mean square of all if that is larger."""
@@ -55,6 +63,11 @@ EVERY = 20
 """Ticks between two looks at a margin."""
 TICKS = (300, 1500)
 """Longest length of the episodes in which margins are looked at, under --quick and otherwise [ticks]."""
+TICK_EVERY = 100
+"""Ticks between two looks at a tick of engine `mujoco`."""
+TICK_STEPS = (1e-6, 1e-6, 1e-6)
+"""Steps of its differences in positions [m, rad], velocities [m/s, rad/s] and targets [rad]: a contact stiffens within
+1 mm."""
 STATE = ("xpos", "xquat", "xipos", "qpos", "qvel")
 """Arrays of the physics in which a margin is differentiated."""
 BALLS = 32
@@ -78,6 +91,16 @@ class Slopes(NamedTuple):
     spread: torch.Tensor
     """Distance of slopes within the step from the estimate."""
 
+    @property
+    def size(self) -> torch.Tensor:
+        """What a difference is a part of: the estimate, or the root mean square of all where that is larger."""
+        return self.estimated.abs().clamp_min(float(self.estimated.square().mean().sqrt()))
+
+    @property
+    def smooth(self) -> torch.Tensor:
+        """True where there is no kink and something to compare."""
+        return (self.spread <= KINK * self.size) & (self.size > 0.0)
+
 
 class Agreement(NamedTuple):
     """Distance of exact slopes from estimated ones."""
@@ -99,15 +122,13 @@ def agreement_of(slopes: Slopes) -> Agreement:
     Args:
         slopes: Shape [n] each.
     """
-    exact, estimated, spread = (part.double() for part in slopes)
-    size = estimated.abs().clamp_min(float(estimated.square().mean().sqrt()))
-    smooth = (spread <= KINK * size) & (size > 0.0)
-    error = ((exact - estimated).abs() / size)[smooth]
-    return Agreement(int(smooth.sum()), len(exact), float(error.max()) if len(error) else 0.0)
+    slopes = Slopes(*(part.double() for part in slopes))
+    error = ((slopes.exact - slopes.estimated).abs() / slopes.size)[slopes.smooth]
+    return Agreement(len(error), len(slopes.exact), float(error.max()) if len(error) else 0.0)
 
 
 def gradients(context: Context) -> CheckFinding:
-    """Compare exact and estimated slopes of conversion and margins in each task, and of the ball's flight."""
+    """Compare exact and estimated slopes of conversion, ticks and margins in each task, and of the ball's flight."""
     rows, wrong, worst = [], [], 0.0
     for tracker in context.sample:
         for task in context.tasks:
@@ -147,11 +168,13 @@ def _measured(context: Context, task: str, tracker: str) -> JsonObject:
     seeds = context.seeds(task, WORLDS)
     try:
         found = {"conversion": _conversion(env, seeds[0])}
-        looks = MarginSlopes()
+        looks: list[MarginSlopes | TickSlopes] = [MarginSlopes()]
+        if env.physics.engine == "mujoco":
+            looks.append(TickSlopes(TICK_EVERY))
         episodes = [SimpleNamespace(episode_seed=seed) for seed in seeds]
         ticks = TICKS[not context.options.quick]
         Rollout(env, policies.get("expert"), episodes, recorder=looks, max_steps=ticks).run()
-        found["margin"] = looks.slopes()
+        found |= {look.of: look.slopes() for look in looks}
         if env.scene.ball_restitution is not None:
             found["ball's flight"] = flight_slopes(RollingBall.of(env.scene), env.torch_device)
     finally:
@@ -196,6 +219,8 @@ def _conversion(env: ArenaEnv, seed: int) -> Slopes:
 class MarginSlopes(Recorder):
     """Slopes of the judge's margin in the state of running episodes, each in one random direction of it."""
 
+    of = "margin"
+
     def __init__(self) -> None:
         """Know no slope yet."""
         self._found: list[Slopes] = []
@@ -216,6 +241,53 @@ class MarginSlopes(Recorder):
     def slopes(self) -> Slopes:
         """All of them."""
         return Slopes(*(torch.cat(parts) for parts in zip(*self._found, strict=True)))
+
+
+class TickSlopes(Recorder):
+    """Slopes of the next tick of engine `mujoco` along running episodes, each in a random direction.
+
+    What is differentiated is a random sum of the positions and velocities after the tick. The estimates are those of a
+    converged solver (`EngineStep`).
+    """
+
+    of = "tick"
+
+    def __init__(self, every: int, steps: Sequence[float] = TICK_STEPS):
+        """Know no slope yet.
+
+        Args:
+            every: Ticks between two looks.
+            steps: Steps of the differences in positions, velocities and targets; what has step 0 stays.
+        """
+        self._every, self._steps, self._looks = every, steps, 0
+        self._found: list[Slopes] = []
+        self._draws = torch.Generator().manual_seed(SEED)
+        self._pair: tuple[EngineStep, EngineStep] | None = None
+
+    def tick(self, env: World) -> None:
+        """See `Recorder.tick`."""
+        acting = env.active & (env.tick > 0)
+        self._looks += bool(acting.any())
+        if not acting.any() or self._looks % self._every != self._every // 2:
+            return
+        physics = cast("ArenaEnv", env).physics
+        exact, converged = self._pair = self._pair or (EngineStep(physics), EngineStep(physics, converged=True))
+        state = exact.state()
+        weights = [torch.randn(part.shape, generator=self._draws).double() for part in (state.qpos, state.qvel)]
+
+        def number(qpos: torch.Tensor, qvel: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+            step = exact if qpos.requires_grad else converged
+            after = step(EngineState(qpos, qvel, state.carried), targets)
+            return (weights[0] * after.qpos).sum(dim=1) + 0.1 * (weights[1] * after.qvel).sum(dim=1)
+
+        at = [state.qpos, state.qvel, torch.from_numpy(physics.ctrl.numpy().copy()).double()]
+        found = _directional(number, at, self._steps, self._draws)
+        self._found.append(Slopes(*(part[torch.from_numpy(acting)] for part in found)))
+
+    def slopes(self) -> Slopes:
+        """All of them; where a contact begins within the step, the estimate is a jump and is set to 0."""
+        exact, estimated, spread = (torch.cat(parts) for parts in zip(*self._found, strict=True))
+        return Slopes(exact, torch.where(spread > estimated.abs(), 0.0, estimated), spread)
 
 
 def _margin_of(env: ArenaEnv) -> tuple[Callable[..., torch.Tensor], list[torch.Tensor]]:

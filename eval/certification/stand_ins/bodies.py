@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from arena_newton.env import ArenaEnv
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK, DriveGains

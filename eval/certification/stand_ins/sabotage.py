@@ -22,8 +22,8 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification.stand_ins.bodies import Body, WithOtherLegs
 from arena_newton.eval.certification.stand_ins.handling import HANDLING
 from arena_newton.eval.folders.failure_stage import FailureStage
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.interaction_view import InteractionView
-from arena_newton.eval.play.run import Factories
 from arena_newton.interfaces import Chunk, Observation, Spawn, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.policies.base import Mask

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.interfaces import Predicate
+from arena_newton.robot.g1 import PALMS
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule
 from arena_newton.tasks import Interaction, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH
 from arena_newton.tasks.judge import (
-    PALMS,
     Condition,
     ConditionsJudge,
     bounding_box,

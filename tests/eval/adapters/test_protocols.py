@@ -27,7 +27,7 @@ from arena_newton.eval.adapters.protocol_comparison import (
     protocol_table,
 )
 from arena_newton.eval.adapters.protocol_options import PROTOCOLS, ProtocolOptions
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.replay import ReplayEpisodes
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from arena_newton.errors import ArenaError
-from arena_newton.eval.bench import bench_learned, bench_start
+from arena_newton.eval.bench import bench_gradients, bench_learned, bench_start
 from arena_newton.policies.learned import learned_card
 from tests.made_packed import packed
 
@@ -21,6 +21,20 @@ def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch
     (figure,) = bench_learned.learned_figures(6)
     assert figure.value > 0.0 and figure.bar == 2.0 and figure.verdict in ("pass", "MISS")
     assert "boxing, 1 world" in figure.name and "pictures" in figure.note and "policy of the package" in figure.note
+
+
+def test_a_gradient_is_counted_in_bare_ticks(monkeypatch):
+    """A tick backward is a judged multiple of a bare one, for each number of worlds; so is what it keeps."""
+    for name, value in (("TASKS", ("football",)), ("WORLDS", (1, 2)), ("BARE", 2)):
+        monkeypatch.setattr(bench_gradients, name, value)
+    one, memory, two = bench_gradients.gradient_figures(1)
+    for figure, worlds in ((one, "1 world"), (two, "2 worlds")):
+        assert (
+            figure.value > 1.0
+            and figure.bar == 50.0
+            and figure.name == (f"a tick backward / bare tick, football, {worlds}, CPU")
+        )
+    assert 1.0 < memory.value < memory.bar and "forward" in one.note
 
 
 def test_three_starts_with_two_caches(monkeypatch):

@@ -15,7 +15,7 @@ from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import inputs, replays, solvable
 from arena_newton.eval.folders.recordings import ActionRecorder
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.policies.experts.base import ExpertPolicy
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding

@@ -16,7 +16,7 @@ from arena_newton.eval.certification.checks.traces import first_difference, play
 from arena_newton.eval.certification.context import CertifyCell
 from arena_newton.eval.certification.finding import Score, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.pages.tables import Table
 from arena_newton.physics import batch
 from arena_newton.pictures.settings import CameraConfig
@@ -209,7 +209,7 @@ def test_dynamics_that_change_more_are_found(tmp_path, monkeypatch):
 
     monkeypatch.setattr(batch, "varied", damped)
     assert certify.run(dataclasses.replace(options, out=str(tmp_path / "damped"))) == 1
-    text = (tmp_path / "damped" / "certify.md").read_text().replace("\\_", "_")
+    text = "".join(page.read_text() for page in (tmp_path / "damped").glob("certify*.md")).replace("\\_", "_")
     assert "boxing: dof_damping is not as drawn" in text and "usual values differ from base mode from tick" in text
 
 

@@ -11,7 +11,7 @@ from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import gradients
 from arena_newton.eval.certification.checks.gradients import Agreement, Slopes, agreement_of, flight_slopes
 from arena_newton.eval.play.env_cache import EnvCache
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 
 ESTIMATES = torch.tensor([1.0, -2.0, 0.001, 0.5, 1.5])
 
@@ -99,22 +99,30 @@ def certified():
 
 
 def test_the_gradients_of_a_task(certified, tmp_path, monkeypatch):
-    """Conversion, margin and flight of football agree; kernels whose adjoints are off by a percent do not."""
+    """Conversion, margin, tick and flight of football agree; conversion and tick that are off by a percent do not."""
     monkeypatch.setattr(gradients, "TICKS", (17, 17))
+    monkeypatch.setattr(gradients, "TICK_EVERY", 20)
     monkeypatch.setattr(gradients, "FLIGHT", 5)
     code, found = certified(tmp_path / "right")
     assert code == 0 and found["verdict"] == "pass", found
     rows = {row[2]: row[3:] for row in found["tables"][0]["rows"]}
-    assert list(rows) == ["conversion", "margin", "ball's flight"]
+    assert list(rows) == ["conversion", "margin", "tick", "ball's flight"]
     assert all(int(compared) > 0 for compared, *_ in rows.values())
     honest = gradients.reference_step
 
     def off(action, state, **limit):
         return honest(action + 0.01 * (action - action.detach()), state, **limit)
 
+    class Off(gradients.EngineStep):
+        def __call__(self, state, targets, factors=None):
+            after = super().__call__(state, targets, factors)
+            return after._replace(qvel=after.qvel + 0.01 * (after.qvel - after.qvel.detach()))
+
     monkeypatch.setattr(gradients, "reference_step", off)
+    monkeypatch.setattr(gradients, "EngineStep", Off)
     code, found = certified(tmp_path / "wrong")
     assert code == 1 and found["notes"][0].startswith("football through pd, conversion: an exact slope is 1.")
+    assert found["notes"][1].startswith("football through pd, tick: an exact slope is 1.")
 
 
 def test_a_flight_that_is_off_is_found(monkeypatch):

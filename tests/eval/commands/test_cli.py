@@ -157,7 +157,7 @@ def test_files_of_several_trackers_have_names_of_their_own(tmp_path):
         (["--max-steps", "0"], "--max-steps 0"),
         (["--drive", "stiff"], "--drive stiff: .*humanoidarena"),
         (["--strip", "--video-size", "big"], "--video-size big"),
-        (["bench", "--what", "all", "nosuch"], "--what nosuch: known are tick throughput learned start all"),
+        (["bench", "--what", "all", "nosuch"], "--what nosuch: known are tick throughput learned gradients start all"),
         (["--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--seeds", "-1"], "seeds"),
         (["--task", "football", "--seeds", "99999999999999999999999"], "--seeds 99999999999999999999999: expected at"),

@@ -41,9 +41,9 @@ from arena_newton.eval.folders.failure_rules import BARS, near_bars, sees_at_sta
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.folders.results import OWN_FOLDER, load_run
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.interaction_view import InteractionView
 from arena_newton.eval.play.own_tracker import own_options
-from arena_newton.eval.play.run import Factories
 from arena_newton.eval.play.signal_recorder import SEEN, SignalRecorder
 from arena_newton.eval.records.journal import EpisodeRecord, Journal, read_journal
 from arena_newton.eval.reports import report

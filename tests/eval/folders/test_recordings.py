@@ -13,7 +13,7 @@ from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.recordings import ActionRecorder, packed_actions
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.files.untrusted_files import array_digest, read_arrays
 from arena_newton.interfaces import Observation

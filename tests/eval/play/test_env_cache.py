@@ -10,7 +10,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.env_cache import EnvCache
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run_flow import group_of
 from arena_newton.eval.suites.suite_records import read_events, read_suite
 

@@ -24,7 +24,7 @@ from arena_newton.eval.certification.stand_ins.sabotage import (
     UnbalancedExpert,
     WeakTracker,
 )
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.policies.experts import Sight
 from arena_newton.policies.experts.style import Style

@@ -19,7 +19,7 @@ from arena_newton.data.recording.episode import EpisodeFile, episode_files
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.play import recording
-from arena_newton.eval.play.run import Factories
+from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.pictures.camera import Camera
 from arena_newton.pictures.settings import CameraConfig

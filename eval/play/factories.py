@@ -1,0 +1,36 @@
+"""Parts of a run into which a program may put its own: `main(arguments, Factories(...))` of `eval.__main__`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from arena_newton import policies, trackers
+from arena_newton.env import ArenaEnv
+from arena_newton.interfaces import Recorder, World
+from arena_newton.policies.base import Policy
+from arena_newton.trackers.base import Tracker
+from arena_newton.usd_scenes import validate
+
+__all__ = ["Factories"]
+
+
+def _no_recorders(env: World) -> Sequence[Recorder]:
+    return ()
+
+
+@dataclass(frozen=True)
+class Factories:
+    """Constructors of a run's parts, for a program that puts its own in (docs/research.md).
+
+    Other processes (`--jobs`) import them by module and name, so there they must not be of the program's main module.
+    """
+
+    env: Callable[..., World] = ArenaEnv
+    tracker: Callable[[str, Path | None], Tracker] = trackers.get
+    policy: Callable[..., Policy] = policies.get
+    check_variant: Callable[[Path, str], None] = validate.check
+    """Raises InputError for a file that is not a scene of the task."""
+    recorders: Callable[[World], Sequence[Recorder]] = _no_recorders
+    """Recorders of an environment, made once for it; their metrics are in the journal (`EpisodeResult.extra`)."""
