@@ -36,6 +36,7 @@ SHORT: dict[str, list[str]] = {
     "research": [*RUN, "--policy", "stand"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
     "word_agent": ["--seeds", "0", "--repeats", "1", "--max-steps", "110", "--out", "OUT"],
+    "worst_start": ["--max-steps", "2", "--iterations", "1"],
     "usd_variant": ["--max-steps", "4", "--out", "OUT"],
 }
 """Example → flags with which it takes seconds; OUT is a folder of the test's own."""
@@ -56,6 +57,7 @@ SAYS = {
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
     "word_agent": r"policy process:python word_agent.py answer, (.*\n)*1 episode, this run took",
+    "worst_start": r"moved \+0.00 \+0.00 m  margin -\d.\d+ m  holds .*\nby gradient: .*\nby cross-entropy: .* s\n",
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
 """Example → what its output holds."""
