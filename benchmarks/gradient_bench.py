@@ -102,9 +102,13 @@ def _loop(task: str, tracker: str, ticks: int, bar: float, factors: Sequence[str
     errors = {}
     for which, (part, direction) in directions.items():
         with torch.no_grad():
-            ends = [number(*at[:part], at[part] + side * STEP * direction, *at[part + 1 :]) for side in (1.0, -1.0)]
+            ends = [
+                number(*(a + side * STEP * direction if k == part else a for k, a in enumerate(at)))
+                for side in (1.0, -1.0)
+            ]
         estimated = float(ends[0] - ends[1]) / (2.0 * STEP)
-        errors[which] = abs(float((gradients[part] * direction).sum()) / estimated - 1.0)
+        slope = float((gradients[part] * direction).sum())
+        errors[which] = abs(slope - estimated) / max(abs(estimated), 1e-9)
     env.close()
     note = ", ".join(f"{which} {error:.0e}" for which, error in errors.items())
     return BenchFigure(name, bar, "", True, max(errors.values()), note)
