@@ -16,6 +16,8 @@ from arena_newton.cli.extras import EXTRAS
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
+LONGER = {"word_agent": 85}
+"""Example of more lines → their number: eyes, memory, decision and protocol of a whole agent."""
 RUN = "--task boxing --tracker twist2 --seeds 0 --repeats 1 --engine mujoco --max-steps 4 --out OUT".split()
 SHORT: dict[str, list[str]] = {
     "aim_a_kick": ["--kick", "7.34", "6.03", "--max-steps", "20"],
@@ -33,6 +35,8 @@ SHORT: dict[str, list[str]] = {
     "refine_reference": ["--max-steps", "4", "--rounds", "2"],
     "research": [*RUN, "--policy", "stand"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
+    "word_agent": ["--seeds", "0", "--repeats", "1", "--max-steps", "110", "--out", "OUT"],
+    "worst_start": ["--max-steps", "2", "--iterations", "1"],
     "usd_variant": ["--max-steps", "4", "--out", "OUT"],
 }
 """Example → flags with which it takes seconds; OUT is a folder of the test's own."""
@@ -52,6 +56,8 @@ SAYS = {
     "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
+    "word_agent": r"policy process:python word_agent.py answer, (.*\n)*1 episode, this run took",
+    "worst_start": r"moved \+0.00 \+0.00 m  margin -\d.\d+ m  holds .*\nby gradient: .*\nby cross-entropy: .* s\n",
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
 """Example → what its output holds."""
@@ -67,7 +73,7 @@ def test_example_says_what_it_shows(path):
     """An example is short, begins with what it shows and how it is called, and uses public names alone."""
     text = path.read_text()
     said = ast.get_docstring(ast.parse(text)) or ""
-    assert text.count("\n") <= MOST_LINES
+    assert text.count("\n") <= LONGER.get(path.stem, MOST_LINES)
     assert "Shows: " in said and f"python examples/{path.name}" in said
     assert not re.search(r"\b(?!self)\w+\._[a-z]|import _[a-z]", text)
 

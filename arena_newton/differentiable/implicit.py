@@ -143,6 +143,8 @@ class ImplicitWorld:
         self._inverse.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
         self._flags = self._inverse.opt.disableflags
         self._data = self.data = mujoco.MjData(model)
+        self._scaled: dict[int, bytes] = {}
+        """Factors that each of the two models has now."""
         self._spare = mujoco.MjData(model)
         joints = model.actuator_trnid[:, 0]
         self._dof, self._qadr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
@@ -245,6 +247,9 @@ class ImplicitWorld:
         return self._data.qpos.copy(), self._data.qvel.copy(), carried
 
     def _scale(self, model: mujoco.MjModel, factors: np.ndarray) -> None:
+        if self._scaled.get(id(model)) == (now := factors.tobytes()):
+            return
+        self._scaled[id(model)] = now
         for field in self._fields:
             getattr(model, field)[:] = getattr(self._origin, field)
         for parameter, factor in zip(self._parameters, factors, strict=True):
