@@ -41,7 +41,7 @@ READING = {
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
 EXAMPLES = """first_episode own_policy process_policy word_agent own_tracker own_mode own_metric research drive_by_code
-    usd_variant record_and_build swap aim_a_kick refine_reference identify_robot fit_motion worst_start
+    usd_variant record_and_build swap aim_a_kick refine_reference fit_motion worst_start
     compare_runs""".split()
 CONFIGURATION = {
     "project": PROJECT["name"],

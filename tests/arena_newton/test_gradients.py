@@ -280,13 +280,16 @@ def test_worlds_differ_by_their_actions_alone():
 
 
 def test_the_documented_programs_run():
-    """The blocks of docs/gradients.md give finite slopes: of a tick, and of a step ahead and a lower stance."""
+    """The blocks of docs/gradients.md give finite slopes: of a tick, of a closed loop, and of speed and height."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "gradients.md").read_text()
-    tick, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
+    tick, loop, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
     world: dict = {"__name__": "docs_gradients"}
     exec(compile(tick, "docs/gradients.md", "exec"), world)
     for leaf in (world["targets"], world["factors"]):
         assert leaf.grad.isfinite().all() and leaf.grad[0].abs().max() > 0.0
+    exec(compile(loop, "docs/gradients.md", "exec"), world)
+    leaves = world["plan"], world["qpos"], world["rolled"].factors
+    assert all(leaf.grad.isfinite().all() for leaf in leaves) and leaves[1].grad.abs().max() > 0.0
     exec(compile(estimate, "docs/gradients.md", "exec"), world)
     found = world["found"]
     assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
