@@ -147,6 +147,8 @@ class ArenaEnv:
         """Latency of the policy's state; None until a world has one."""
         self._push_tick = np.full(self.worlds, NO_TICK)
         """Tick before which each world is pushed."""
+        self.planning = ""
+        """Change of the contacts that makes this a planning model, which no `Rollout` takes; empty: the engine."""
         self._anchored = np.zeros(self.worlds, dtype=bool)
         self._stand = torch.tensor(STAND_ACTION, device=self.torch_device)
         self._chosen, self._stepping = WorldMask(self.worlds, self.device), WorldMask(self.worlds, self.device)
@@ -192,7 +194,7 @@ class ArenaEnv:
     def describe(self) -> dict[str, object]:
         """Configuration to record with every result: engine, physics rate, drive, start-up and tracker."""
         return {
-            "engine": self.engine,
+            "engine": f"{self.engine}, planning model: {self.planning}" if self.planning else self.engine,
             "device": str(self.device),
             "physics_dt": self.rate.dt,
             "substeps": self.rate.substeps,
@@ -432,8 +434,13 @@ class ArenaEnv:
         self._push(stepping)
         self.physics.set_active(stepping)
         self.physics.step()
+        return self.judge_tick(stepping)
+
+    def judge_tick(self, stepping: np.ndarray) -> np.ndarray:
+        """Judge what the physics has after a tick of some worlds, bool, shape [worlds]; codes as of `step`."""
+        starting = stepping & (self.tick < 0)
         self._stepping.choose(stepping)
-        if worlds is None or np.array_equal(stepping, self.active):
+        if (stepping == self.active).all():
             self.judge.evaluate(self.physics)
             self._rule()
         else:

@@ -111,6 +111,8 @@ class Rollout:
             on_finish: Called with each result, in the order of ending.
             on_tick: Called each tick with the number of active worlds.
         """
+        if planning := getattr(env, "planning", ""):
+            raise InputError(f"these worlds are a planning model ({planning}): no episode is played or judged in them")
         self.env, self.policy = env, policy
         self._view = PolicyView(env)
         self.recorders: Sequence[Recorder] = [recorder] if isinstance(recorder, Recorder) else recorder

@@ -15,6 +15,7 @@ MODULES = (
     "arena_newton.tasks",
     "arena_newton.rule_sets",
     "arena_newton.rules.rule_types",
+    "arena_newton.rules.modes",
     "arena_newton.robot.canonical",
     "arena_newton.eval.plan.episode_plan",
     "arena_newton.eval.play.factories",

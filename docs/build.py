@@ -26,10 +26,11 @@ READING = {
     "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
     "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
         docs/design/identity""",
-    "How-to": """docs/policies docs/serving docs/asking_servers docs/trackers docs/authoring docs/research docs/experts
-        docs/recording docs/datasets docs/curation docs/training docs/training_policies docs/recipes docs/loop docs/suites
-        docs/machines docs/comparing docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym
-        docs/motions docs/gradients docs/api examples/index""",
+    "How-to": """docs/policies docs/checkpoints docs/policy_server docs/serving docs/asking_servers docs/trackers
+        docs/authoring docs/add_a_task docs/research docs/experts docs/recording docs/datasets docs/curation
+        docs/training docs/training_policies docs/recipes docs/loop docs/suites docs/machines docs/comparing
+        docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients
+        docs/api examples/index""",
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
     "Results": """docs/results/README docs/results/findings docs/results/reproductions docs/results/trainings
@@ -40,7 +41,8 @@ READING = {
 }
 """Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
 EXAMPLES = """first_episode own_policy process_policy word_agent own_tracker own_mode own_metric research drive_by_code
-    usd_variant record_and_build swap aim_a_kick refine_reference compare_runs""".split()
+    usd_variant record_and_build swap aim_a_kick refine_reference identify_robot fit_motion worst_start
+    compare_runs""".split()
 CONFIGURATION = {
     "project": PROJECT["name"],
     "copyright": "The arena_newton contributors, Apache-2.0",

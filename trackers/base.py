@@ -85,6 +85,22 @@ class Tracker:
         """Joint targets of this tick [rad], MuJoCo order, shape [worlds, 29]; see `interfaces.Tracker`."""
         raise TypeError(f"tracker {self.name!r} defines no step()")
 
+    def graded(self, worlds: int) -> Tracker:
+        """The same tracker with ticks that autograd records, in float64 on the CPU, with no past.
+
+        Raises:
+            InputError: It has none.
+        """
+        raise InputError(f"tracker {self.name} has no gradient: it defines no graded()")
+
+    def memory(self) -> tuple[torch.Tensor, ...]:
+        """All that the next tick of a `graded` tracker starts from."""
+        return ()
+
+    def resumed(self, memory: Sequence[torch.Tensor]) -> Tracker:
+        """A `graded` tracker that goes on from a memory."""
+        return self
+
     def describe(self) -> dict[str, Any]:
         """Facts to record with every result to name this tracker exactly; drive and rate are the environment's."""
         window = {"lookahead": self.lookahead} if self.lookahead else {}

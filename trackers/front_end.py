@@ -11,13 +11,15 @@ Everything runs on any torch device without waiting for it, so a CUDA graph can 
 from __future__ import annotations
 
 import abc
+import copy
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Concatenate, Self
 
 import torch
 
+from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.trackers import interface
 from arena_newton.trackers.base import Tracker
@@ -27,7 +29,19 @@ from arena_newton.trackers.inference.networks import Symmetric
 from arena_newton.trackers.inference.onnx_session import OnnxSession
 from arena_newton.trackers.interface import JOINTS, ActionForm, residual_form
 
-__all__ = ["JOINTS", "ActionForm", "FrontEnd", "Mirror", "NetworkTracker", "column", "plain", "residual_form", "store"]
+__all__ = [
+    "JOINTS",
+    "ActionForm",
+    "FrontEnd",
+    "GradedTracker",
+    "Mirror",
+    "NetworkTracker",
+    "column",
+    "plain",
+    "residual_form",
+    "store",
+    "without_gradients",
+]
 
 
 def column(mask: Sequence[bool] | torch.Tensor | None, device: torch.device) -> torch.Tensor | None:
@@ -43,15 +57,17 @@ def store(target: torch.Tensor, value: torch.Tensor, rows: torch.Tensor | None) 
     target.copy_(value)
 
 
-def without_gradients[**P, R](work: Callable[P, R]) -> Callable[P, R]:
-    """`torch.no_grad`, which takes 3 µs a call, only where gradients are recorded."""
+def without_gradients[F: FrontEnd, **P, R](
+    work: Callable[Concatenate[F, P], R],
+) -> Callable[Concatenate[F, P], R]:
+    """`torch.no_grad`, which takes 3 µs a call, only where gradients are recorded and the front end is not `graded`."""
 
     @functools.wraps(work)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not torch.is_grad_enabled():
-            return work(*args, **kwargs)
+    def call(self: F, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        if self.graded or not torch.is_grad_enabled():
+            return work(self, *args, **kwargs)
         with torch.no_grad():
-            return work(*args, **kwargs)
+            return work(self, *args, **kwargs)
 
     return call
 
@@ -79,7 +95,10 @@ def plain(*signs: float) -> tuple[Sequence[int], Sequence[float]]:
 
 
 class FrontEnd(abc.ABC):
-    """Base of all front ends; a subclass sets the widths and writes `prefill`, `write` and `advance`."""
+    """Base of all front ends; a subclass sets the widths and writes `prefill`, `write` and `advance`.
+
+    Where it writes buffers by operations in place (`copy_`, `mul_`) rather than by `out=`, gradients pass (`graded`).
+    """
 
     obs_width: int = 0
     """Width of the observation."""
@@ -96,6 +115,8 @@ class FrontEnd(abc.ABC):
 
     device: torch.device = torch.device("cpu")
     """Device of the buffers; set by `bind`."""
+    graded: bool = False
+    """True if autograd records the ticks of buffers in float64; see `GradedTracker`."""
     obs: torch.Tensor
     """The observation's buffer, float32, shape [worlds, obs_width]."""
     last_action: torch.Tensor
@@ -151,10 +172,9 @@ class FrontEnd(abc.ABC):
         store(self.last_action, raw, rows)
         self.advance(rows)
         raw = self.to_mujoco(raw)
+        self._targets.copy_(raw)
         if self.action_form.clip > 0.0:
-            torch.clamp(raw, -self.action_form.clip, self.action_form.clip, out=self._targets)
-        else:
-            self._targets.copy_(raw)
+            self._targets.clamp_(-self.action_form.clip, self.action_form.clip)
         return self._targets.mul_(self._scale).add_(self.base)
 
     def mirror_obs(self) -> Mirror:
@@ -270,9 +290,73 @@ class NetworkTracker(Tracker):
             mask = None
         return (self._graph or self._tick)(command, state, mask)
 
+    def graded(self, worlds: int) -> GradedTracker:
+        """See `Tracker.graded`.
+
+        Raises:
+            InputError: A network in ONNX Runtime that torch modules cannot repeat.
+        """
+        if isinstance(self.network, OnnxSession):
+            network = self.network.as_torch()
+        elif any(isinstance(module, OnnxSession) for module in self.network.modules()):
+            raise InputError(f"tracker {self.name} has no gradient: {self.checkpoint} runs in ONNX Runtime")
+        else:
+            network = copy.deepcopy(self.network)
+        return GradedTracker(self.front_end, network.to("cpu", torch.float64).requires_grad_(False), worlds)
+
     def _tick(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None) -> torch.Tensor:
         self.front_end.observe(command, state)
         return self.front_end.act(self._runner.run(), mask)
+
+
+class GradedTracker(Tracker):
+    """Ticks of a network's tracker that autograd records: its own front end and network, in float64 on the CPU.
+
+    The buffers of the front end are those of one graph; `resumed` continues with others, from what `memory` gives.
+    """
+
+    def __init__(self, front_end: FrontEnd, network: torch.nn.Module, worlds: int):
+        """Bind a copy of a front end; the network is taken as it is."""
+        self._origin, self.network, self.worlds = front_end, network, worlds
+        self.front_end = copy.copy(front_end)
+        self.front_end.graded = True
+        usual = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float64)  # of all buffers, those of a subclass too
+        try:
+            # Views of a buffer without a history could not be written to once another view has got one.
+            obs = torch.zeros(worlds, front_end.obs_width, requires_grad=True).clone()
+            self.front_end.bind(worlds, obs=obs)
+        finally:
+            torch.set_default_dtype(usual)
+        self.front_end.reset()
+        self._buffers = [
+            value
+            for name, value in vars(self.front_end).items()
+            if isinstance(value, torch.Tensor) and value is not vars(front_end).get(name)
+            if not value._is_view() and value.dtype != torch.long
+        ]
+
+    def memory(self) -> tuple[torch.Tensor, ...]:
+        """Buffers from which the next tick starts."""
+        return tuple(value.clone() for value in self._buffers)
+
+    def resumed(self, memory: Sequence[torch.Tensor]) -> GradedTracker:
+        """The tracker with buffers of its own, which start from a memory."""
+        other = GradedTracker(self._origin, self.network, self.worlds)
+        for buffer, value in zip(other._buffers, memory, strict=True):
+            buffer.copy_(value)
+        for view in vars(other.front_end).values():
+            getattr(view, "grad_fn", None)  # a view takes the history of its buffer when it is asked for it
+        return other
+
+    def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
+        """See `Tracker.prefill`."""
+        self.front_end.prefill(command, state, mask)
+
+    def step(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """See `Tracker.step`; float64, a tensor of its own."""
+        observation = self.front_end.observe(command, state).clone()
+        return self.front_end.act(self.network(observation), mask).clone()
 
 
 Tick = Callable[[TrackerCommand, RobotState, torch.Tensor | None], torch.Tensor]

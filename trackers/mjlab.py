@@ -25,7 +25,7 @@ from arena_newton.trackers.inference.onnx_session import OnnxSession
 from arena_newton.trackers.interface import JOINTS, ActionForm
 from arena_newton.usd_scenes.g1.links import LINKS
 
-__all__ = ["TERMS", "MjlabFrontEnd", "MjlabTracker", "Term", "from_checkpoint"]
+__all__ = ["TERMS", "MjlabFrontEnd", "MjlabTracker", "ObservedTerm", "from_checkpoint"]
 
 IMU = (0.04525, 0.0, -0.08339)
 """Position of the IMU in the pelvis [m] (mjlab's model of the G1), whose velocity is `base_lin_vel`."""
@@ -44,7 +44,7 @@ _PER_JOINT = ("joint_stiffness", "joint_damping", "default_joint_pos", "action_s
 
 
 @dataclass(frozen=True)
-class Term:
+class ObservedTerm:
     """A term of the observation, by its name in the metadata."""
 
     width: int
@@ -54,16 +54,16 @@ class Term:
     """Fields of `interfaces.NEEDS` that it reads."""
 
 
-TERMS: Mapping[str, Term] = {
-    "command": Term(2 * JOINTS, lambda f, c, s: torch.cat((f.ordered(c.joints), f.ordered(c.joint_vel)), 1)),
-    "motion_anchor_pos_b": Term(3, lambda f, c, s: f.anchor_offset(c, s), ("position",)),
-    "motion_anchor_ori_b": Term(6, lambda f, c, s: f.anchor_turn(c, s)),
-    "base_lin_vel": Term(3, lambda f, c, s: f.imu_velocity(s), ("lin_vel",)),
-    "base_ang_vel": Term(3, lambda f, c, s: s.ang_vel_body),
-    "projected_gravity": Term(3, lambda f, c, s: gravity_in_body(s.quat)),
-    "joint_pos": Term(JOINTS, lambda f, c, s: f.ordered(s.joint_pos - f.pose)),
-    "joint_vel": Term(JOINTS, lambda f, c, s: f.ordered(s.joint_vel)),
-    "actions": Term(JOINTS, lambda f, c, s: f.last_action),
+TERMS: Mapping[str, ObservedTerm] = {
+    "command": ObservedTerm(2 * JOINTS, lambda f, c, s: torch.cat((f.ordered(c.joints), f.ordered(c.joint_vel)), 1)),
+    "motion_anchor_pos_b": ObservedTerm(3, lambda f, c, s: f.anchor_offset(c, s), ("position",)),
+    "motion_anchor_ori_b": ObservedTerm(6, lambda f, c, s: f.anchor_turn(c, s)),
+    "base_lin_vel": ObservedTerm(3, lambda f, c, s: f.imu_velocity(s), ("lin_vel",)),
+    "base_ang_vel": ObservedTerm(3, lambda f, c, s: s.ang_vel_body),
+    "projected_gravity": ObservedTerm(3, lambda f, c, s: gravity_in_body(s.quat)),
+    "joint_pos": ObservedTerm(JOINTS, lambda f, c, s: f.ordered(s.joint_pos - f.pose)),
+    "joint_vel": ObservedTerm(JOINTS, lambda f, c, s: f.ordered(s.joint_vel)),
+    "actions": ObservedTerm(JOINTS, lambda f, c, s: f.last_action),
 }
 """Terms that networks of the two projects see."""
 
@@ -72,6 +72,8 @@ class MjlabFrontEnd(FrontEnd):
     """The terms that a file names, in its order; nothing is remembered but the last action."""
 
     graphable = True
+    pose: torch.Tensor
+    """Default pose [rad], MuJoCo order, shape [29]."""
 
     def __init__(
         self,
@@ -119,8 +121,8 @@ class MjlabFrontEnd(FrontEnd):
 
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write the terms."""
-        torch.cat([TERMS[name].value(self, command, state) for name in self.terms], 1, out=self.obs)
-        self.obs.mul_(self._scales)
+        values = [TERMS[name].value(self, command, state) for name in self.terms]
+        self.obs.copy_(torch.cat(values, 1)).mul_(self._scales)
 
     def advance(self, rows: torch.Tensor | None = None) -> None:
         """Nothing: the last action is the base's."""

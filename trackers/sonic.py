@@ -24,7 +24,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, SONIC_DRIVE, PhysicsRate
 from arena_newton.robot.rotations import heading_quat
-from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
+from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store, without_gradients
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, PartialNetwork, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.onnx_session import OnnxSession
@@ -260,13 +260,11 @@ class SonicFrontEnd(FrontEnd):
         four = [JOINTS * part + joint for part in range(4) for joint in CANONICAL_TO_MUJOCO]
         self._four_to_canonical = torch.tensor(four, device=self.device)
         self._from_canonical = torch.tensor(MUJOCO_TO_CANONICAL, device=self.device)
-        self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, rows=worlds, width=8, device=self.device)
-        self._rot6d = Quadratic(ROT6D, IDENTITY_6D, rows=worlds, device=self.device)
-        at = slices(self.variant.layout | PROPRIOCEPTION_LAYOUT)
+        self._relative_and_down = Quadratic(RELATIVE_AND_DOWN, DOWN, width=8, device=self.device)
+        self._rot6d = Quadratic(ROT6D, IDENTITY_6D, device=self.device)
+        at = slices({**self.variant.layout, **PROPRIOCEPTION_LAYOUT})
         if self.lookahead:
-            rows = {"rows": worlds * FRAMES, "device": self.device}
-            self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], width=8, **rows)
-            self._rot6ds = Quadratic(ROT6D, IDENTITY_6D, **rows)
+            self._relatives = Quadratic(RELATIVE_AND_DOWN[:4], DOWN[:4], width=8, device=self.device)
             self._to_canonical = torch.tensor(CANONICAL_TO_MUJOCO, device=self.device)
 
         def frames(name: str) -> torch.Tensor:
@@ -287,7 +285,6 @@ class SonicFrontEnd(FrontEnd):
             first = at[name].start - self.encoder_width
             source += [first + (i if i >= newest else i + size // FRAMES) for i in range(size)]
         self._source = torch.tensor(source, device=self.device)
-        self._shifted = torch.zeros(worlds, PROPRIOCEPTION, device=self.device)
         self._first_tick = torch.ones(worlds, 1, 1, dtype=torch.bool, device=self.device)
         # Saves two operations per tick on the CPU; elsewhere a graph may be recorded now and replayed after a reset.
         self._may_be_first = True
@@ -300,7 +297,7 @@ class SonicFrontEnd(FrontEnd):
         rows = column(mask, self.device)
         self._first_tick.fill_(True) if rows is None else self._first_tick.logical_or_(rows[:, None])
 
-    @torch.no_grad()
+    @without_gradients
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the measured histories of the masked worlds with the current frame; past actions stay."""
         self.write(command, state)
@@ -339,8 +336,9 @@ class SonicFrontEnd(FrontEnd):
         self._now_joint_pos.copy_(pos)
         self._now_joint_vel.copy_(vel)
         if self._may_be_first:
-            self._joint_pos.copy_(torch.where(self._first_tick, pos, self._joint_pos))
-            self._joint_vel.copy_(torch.where(self._first_tick, vel, self._joint_vel))
+            first = self._first_tick.clone()  # `advance` changes it, a gradient needs it
+            self._joint_pos.copy_(torch.where(first, pos, self._joint_pos))
+            self._joint_vel.copy_(torch.where(first, vel, self._joint_vel))
 
     def _write_window(self, command: TrackerCommand, state: RobotState) -> None:
         """Write this tick's reference and the coming ones that the window shows; `anchor` is another mode's."""
@@ -359,12 +357,11 @@ class SonicFrontEnd(FrontEnd):
         here = (heading_quat(state.quat) if self.variant.heading else state.quat)[:, None].expand_as(quats)
         here, pairs = here.flatten(0, 1), torch.cat((here, quats), 2).flatten(0, 1)
         relative = self._relatives(here, pairs)
-        self._anchors.copy_(self._rot6ds(relative, relative).view_as(self._anchors))
+        self._anchors.copy_(self._rot6d(relative, relative).view_as(self._anchors))
 
     def advance(self, rows: torch.Tensor | None = None) -> None:
         """Shift the histories; the raw output becomes the newest action."""
-        torch.index_select(self._proprio, 1, self._source, out=self._shifted)
-        store(self._proprio, self._shifted, rows)
+        store(self._proprio, self._proprio.index_select(1, self._source), rows)
         store(self._now_action, self.last_action, rows)
         if self._may_be_first:
             self._first_tick.fill_(False) if rows is None else self._first_tick.logical_and_(~rows[:, None])

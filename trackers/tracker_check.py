@@ -50,7 +50,7 @@ def _check(argv: Sequence[str]) -> int:
     results = check_tracker(get(args.name, args.checkpoint), worlds=args.worlds, device=args.device, raises=False)
     print(table(f"tracker {args.name}", results))
     if args.stand:
-        from arena_newton.trackers.evaluation.stand import stand
+        from arena_newton.trackers.evaluation.stand_check import stand
 
         stood = stand(get(args.name, args.checkpoint), device=args.device)
         print(table(f"tracker {args.name}, {len(stood)} measures of standing", stood))

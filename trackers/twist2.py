@@ -19,7 +19,7 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS, TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE, PhysicsRate
 from arena_newton.robot.rotations import atan2
-from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store
+from arena_newton.trackers.front_end import FrontEnd, Mirror, NetworkTracker, column, plain, store, without_gradients
 from arena_newton.trackers.inference import weights_file
 from arena_newton.trackers.inference.networks import InputNorm, TrackerNetwork, folded, mlp, shrink_last
 from arena_newton.trackers.inference.onnx_session import OnnxSession
@@ -104,16 +104,15 @@ class Twist2FrontEnd(FrontEnd):
         self._past, self._future = views["history"], views["future"]
         self._later, self._earlier = self._past[:, FRAME:], self._past[:, :-FRAME]
         self._newest = self._past[:, -FRAME:]
-        self._shifted = torch.zeros(worlds, (HISTORY - 1) * FRAME, device=self.device)
         padded = -(-worlds // _VECTOR) * _VECTOR
-        self._tilt_terms = Quadratic(TILT_TERMS, UPRIGHT, rows=worlds, device=self.device)
-        self._roll, self._pitch = self._tilt.unbind(1)
+        self._tilt_terms = Quadratic(TILT_TERMS, UPRIGHT, device=self.device)
+        self._roll, self._pitch = self._tilt[:, 0], self._tilt[:, 1]
         self._padded = torch.zeros(padded, device=self.device)
         self._pitch_sine = self._padded[:worlds]
         self._joint_vel_scale = torch.full((JOINTS,), JOINT_VEL_SCALE, device=self.device)
         self._joint_vel_scale[[i for i, name in enumerate(MUJOCO_JOINTS) if "ankle" in name]] = 0.0
 
-    @torch.no_grad()
+    @without_gradients
     def prefill(self, command: TrackerCommand, state: RobotState, mask: torch.Tensor | None = None) -> None:
         """Fill the history of the masked worlds with the current frame: a start is then no jump for the network."""
         self.write(command, state)
@@ -122,8 +121,7 @@ class Twist2FrontEnd(FrontEnd):
 
     def advance(self, rows: torch.Tensor | None = None) -> None:
         """Move the current frame into the history, which takes it only after the network has seen it."""
-        self._shifted.copy_(self._later)
-        store(self._earlier, self._shifted, rows)
+        store(self._earlier, self._later.clone(), rows)
         store(self._newest, self._frame, rows)
 
     def mirror_obs(self) -> Mirror:
@@ -140,10 +138,10 @@ class Twist2FrontEnd(FrontEnd):
     def write(self, command: TrackerCommand, state: RobotState) -> None:
         """Write the current frame and the command's second copy."""
         self._mimic.copy_(command.mimic)
-        torch.mul(state.ang_vel_body, ANG_VEL_SCALE, out=self._ang_vel)
+        self._ang_vel.copy_(state.ang_vel_body).mul_(ANG_VEL_SCALE)
         self._write_roll_pitch(state.quat)
-        torch.sub(state.joint_pos, self._default, out=self._joints)
-        torch.mul(state.joint_vel, self._joint_vel_scale, out=self._joint_vel)
+        self._joints.copy_(state.joint_pos).sub_(self._default)
+        self._joint_vel.copy_(state.joint_vel).mul_(self._joint_vel_scale)
         self._past_action.copy_(self.last_action)
         self._frame.clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
         self._future.copy_(self._mimic)
@@ -151,9 +149,9 @@ class Twist2FrontEnd(FrontEnd):
     def _write_roll_pitch(self, quat: torch.Tensor) -> None:
         """Write roll atan2(2(wx + yz), 1 - 2(x² + y²)) and pitch asin(clamp(2(wy - zx))) [rad]."""
         roll_sine, roll_cosine, pitch_sine = self._tilt_terms(quat, quat).unbind(1)
-        atan2(roll_sine, roll_cosine, out=self._roll)
+        self._roll.copy_(atan2(roll_sine, roll_cosine))
         self._pitch_sine.copy_(pitch_sine)
-        torch.asin(self._padded.clamp_(-1.0, 1.0), out=self._padded)
+        self._padded.clamp_(-1.0, 1.0).asin_()
         self._pitch.copy_(self._pitch_sine)
 
 

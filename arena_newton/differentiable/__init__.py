@@ -3,21 +3,38 @@
 `docs/gradients.md` says what is exact, what is estimated and what has no gradient.
 """
 
-from arena_newton.differentiable.closed_loop import Differences, Played, central_differences, play
+from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state
 from arena_newton.differentiable.engine_step import EngineState, EngineStep
+from arena_newton.differentiable.estimates import (
+    Differences,
+    Played,
+    Reach,
+    central_differences,
+    cross_entropy,
+    play,
+    reach,
+)
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
+from arena_newton.differentiable.soft_onset import soft_onset
 
 __all__ = [
     "Differences",
     "EngineState",
     "EngineStep",
     "Played",
+    "Reach",
     "ReferenceState",
+    "Rolled",
     "RollingBall",
     "ball_flight",
     "central_differences",
+    "closed_loop",
+    "cross_entropy",
     "play",
+    "reach",
     "reference_step",
+    "reset_state",
+    "soft_onset",
     "success_margin",
 ]

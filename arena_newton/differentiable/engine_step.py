@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 
@@ -98,6 +99,11 @@ class EngineStep:
             if tensor.shape != (len(self._worlds), width):
                 raise InputError(f"EngineStep: {name} of shape {list(tensor.shape)}, not {[len(self._worlds), width]}")
         return EngineState(*_Tick.apply(self, *(tensor.cpu().double() for tensor in given)))
+
+    @property
+    def data(self) -> list[mujoco.MjData]:
+        """MuJoCo's data of each world as the last tick forward left it, contact forces included."""
+        return [world.data for world in self._worlds]
 
     def stacked(
         self, work: Callable[..., Sequence[np.ndarray]], *rows: Iterable[np.ndarray | Inputs]

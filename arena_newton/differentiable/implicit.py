@@ -36,6 +36,11 @@ _AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
                   [[0, 0, 0, -1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]]], dtype=np.float64)  # fmt: skip
 """`_AXES[i] @ quat` is quat times the i-th imaginary unit, twice its change per angle about body axis i."""
 
+_WORLD_AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]],
+                        [[0, 0, -1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, -1, 0, 0]],
+                        [[0, 0, 0, -1], [0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0]]], dtype=np.float64)  # fmt: skip
+"""The same with the unit to the left, about axis i of the world."""
+
 Scaled = list[tuple[str, list[int] | tuple[list[int], int]]]
 """Fields of a MuJoCo model, and the index of the numbers in each, that one parameter scales."""
 
@@ -137,7 +142,9 @@ class ImplicitWorld:
         self._inverse.opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)  # for dC/dv
         self._inverse.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
         self._flags = self._inverse.opt.disableflags
-        self._data = mujoco.MjData(model)
+        self._data = self.data = mujoco.MjData(model)
+        self._scaled: dict[int, bytes] = {}
+        """Factors that each of the two models has now."""
         self._spare = mujoco.MjData(model)
         joints = model.actuator_trnid[:, 0]
         self._dof, self._qadr = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
@@ -208,6 +215,26 @@ class ImplicitWorld:
             at_factors[k] = (self._inertial(weighed, moved) - base) / _FACTOR_STEP
         return Inputs(self._ambient(given.qpos, at_q), at_v, np.zeros_like(given.carried), at_targets, at_factors)
 
+    def poses(self, qpos: np.ndarray, carried: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and orientations wxyz of the bodies, shapes [nbody, 3] and [nbody, 4]."""
+        mujoco.mj_setState(self._model, self._data, carried, _STATE)
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._data.xpos.copy(), self._data.xquat.copy()
+
+    def poses_adjoint(
+        self, qpos: np.ndarray, carried: np.ndarray, at_xpos: np.ndarray, at_xquat: np.ndarray
+    ) -> tuple[np.ndarray]:
+        """Gradient to qpos from gradients to the bodies' poses."""
+        m, d = self._model, self._data
+        self.poses(qpos, carried)
+        mujoco.mj_comPos(m, d)
+        found, by_pos, by_turn = np.zeros(m.nv), np.empty((3, m.nv)), np.empty((3, m.nv))
+        for body in np.flatnonzero(at_xpos.any(axis=1) | at_xquat.any(axis=1)).tolist():
+            mujoco.mj_jacBody(m, d, by_pos, by_turn, body)
+            found += at_xpos[body] @ by_pos + 0.5 * (_WORLD_AXES @ d.xquat[body]) @ at_xquat[body] @ by_turn
+        return (self._ambient(qpos, found),)
+
     def _begin(self, given: Inputs) -> None:
         d = self._data
         self._scale(self._model, given.factors)
@@ -220,6 +247,9 @@ class ImplicitWorld:
         return self._data.qpos.copy(), self._data.qvel.copy(), carried
 
     def _scale(self, model: mujoco.MjModel, factors: np.ndarray) -> None:
+        if self._scaled.get(id(model)) == (now := factors.tobytes()):
+            return
+        self._scaled[id(model)] = now
         for field in self._fields:
             getattr(model, field)[:] = getattr(self._origin, field)
         for parameter, factor in zip(self._parameters, factors, strict=True):

@@ -1,13 +1,15 @@
 """Gradients of the kernels for torch: reference integration and success margins as `torch.autograd.Function`.
 
 Forward runs the very kernel that the benchmark runs, recorded on a `wp.Tape`; backward replays the tape. Gradients are
-those of a function that is smooth almost everywhere: at ties of a minimum they are one of the one-sided ones.
+those of a function that is smooth almost everywhere: at ties of a minimum they are one of the one-sided ones. Kernels
+compute in float32; in float64 the reference is integrated by torch.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,9 +17,11 @@ import torch
 import warp as wp
 
 from arena_newton.cli.quiet import quiet_warp
-from arena_newton.kernels.canonical import ReferencePose, launch_integrate
+from arena_newton.kernels.canonical import LEVEL_FLOOR, ReferencePose, launch_integrate
 from arena_newton.physics.streams import on_torch_stream
-from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, TICK
+from arena_newton.robot import rotations
+from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_TO_CANONICAL, TICK
 
 __all__ = ["Recording", "ReferenceState", "recorded", "reference_step", "success_margin"]
 
@@ -25,6 +29,7 @@ quiet_warp()  # a tensor handed over may be the first that the process asks of W
 
 Recording = Callable[..., tuple[wp.Tape, list[wp.array]]]
 """Launches on a tape: (arrays) → the tape and its outputs."""
+JOINTS = len(CANONICAL_TO_MUJOCO)
 _FLOAT_STATE = ("position", "quat", "joints", "prev_yaw", "prev_z")
 
 
@@ -42,7 +47,7 @@ class ReferenceState(NamedTuple):
     prev_z: torch.Tensor
     """Height of the last action [m], shape [worlds]."""
     heading: torch.Tensor
-    """Heading of the robot at reset [rad], shape [worlds]; a constant."""
+    """Heading of the robot at reset [rad], shape [worlds]; in float32 a constant."""
     steps: torch.Tensor
     """Steps since the reset, int32, shape [worlds]."""
     joint_vel: torch.Tensor
@@ -52,6 +57,18 @@ class ReferenceState(NamedTuple):
     def of(cls, ref: ReferencePose) -> ReferenceState:
         """Copies the state of a reference pose."""
         return cls(*(wp.to_torch(getattr(ref, name), requires_grad=False).clone() for name in cls._fields))
+
+    @classmethod
+    def anchored(cls, root: torch.Tensor) -> ReferenceState:
+        """State of a reference that starts at the robot, as `kernels.canonical.launch_reset_reference` sets it.
+
+        Args:
+            root: Position [m] and orientation wxyz of the robot, shape [worlds, 7].
+        """
+        quat = torch.nn.functional.normalize(root[:, 3:7], dim=1)
+        yaw, still = rotations.heading(quat), root.new_zeros(len(root), JOINTS)
+        steps = torch.zeros(len(root), dtype=torch.int32, device=root.device)
+        return cls(root[:, :3], quat, still, yaw, root[:, 2], yaw, steps, still)
 
 
 def _backpropagate(
@@ -108,13 +125,15 @@ def reference_step(
     """One step of the canonical reference, differentiable in the action and in the state before it.
 
     Args:
-        action: Canonical actions, float32, shape [worlds, 40].
+        action: Canonical actions, float32 (the kernel itself) or float64 (the same by torch), shape [worlds, 40].
         state: The state before; `ReferenceState.of` copies it from a running reference.
         max_root_delta_deg: Largest rotation [deg] between consecutive targets; 0 = no limit.
 
     Returns:
         The mimic command, shape [worlds, 35], and the state after, whose position and quat are the target pose.
     """
+    if action.dtype == torch.float64:
+        return _double_step(action, state, math.radians(max_root_delta_deg))
     worlds = action.shape[0]
     steps = torch.empty_like(state.steps)
 
@@ -140,6 +159,37 @@ def reference_step(
         record, action, *(getattr(state, name) for name in _FLOAT_STATE)
     )
     return mimic, ReferenceState(position, quat, joints, prev_yaw, prev_z, state.heading, steps, joint_vel)
+
+
+def _double_step(
+    action: torch.Tensor, state: ReferenceState, max_root_delta: float
+) -> tuple[torch.Tensor, ReferenceState]:
+    """`kernels.canonical.integrate_kernel` in float64."""
+    first = state.steps == 0
+    moved, z = action[:, ACTION["root_xy_delta"]], action[:, 2]
+    target = rotations.quat_multiply(
+        rotations.quat_from_yaw(state.heading), rotations.quat_from_rot6d(action[:, ACTION["root_rot6d"]])
+    )
+    if max_root_delta > 0.0:
+        turn = rotations.rotation_vector(rotations.quat_multiply(rotations.quat_conjugate(state.quat), target))
+        half = 0.5 * turn.norm(dim=1, keepdim=True).clamp_min(max_root_delta)  # of those beyond the limit
+        axis, sine, cosine = 0.5 * turn / half, math.sin(0.5 * max_root_delta), math.cos(0.5 * max_root_delta)
+        limit = torch.cat([torch.full_like(half, cosine), sine * axis], dim=1)
+        limited = rotations.quat_multiply(state.quat, limit)
+        target = torch.where(2.0 * half > max_root_delta, limited, target)
+    rotation = rotations.matrix_from_quat(target)
+    level = rotation[:, 2, 2]
+    rise = torch.where(first, 0.0, z - state.prev_z) - (rotation[:, 2, :2] * moved).sum(1)
+    flat = level.abs() > LEVEL_FLOOR
+    local = torch.cat([moved, torch.where(flat, rise / torch.where(flat, level, 1.0), 0.0)[:, None]], dim=1)
+    position = torch.cat([state.position[:, :2] + (rotation[:, :2] @ local[:, :, None])[..., 0], z[:, None]], dim=1)
+    yaw, joints = rotations.heading(target), action[:, ACTION["joint_pos"]]
+    joint_vel = torch.where(first[:, None], 0.0, (joints - state.joints) / TICK)
+    yaw_rate = rotations.wrap_angle(yaw - state.prev_yaw) / TICK
+    ordered = joints[:, list(MUJOCO_TO_CANONICAL)]
+    parts = moved / TICK, z[:, None], rotations.roll_pitch(target), yaw_rate[:, None], ordered
+    after = ReferenceState(position, target, joints, yaw, z, state.heading, state.steps + 1, joint_vel)
+    return torch.cat(parts, dim=1), after
 
 
 def success_margin(launch: Callable[..., None], **arguments: object) -> torch.Tensor:

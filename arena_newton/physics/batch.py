@@ -70,6 +70,11 @@ class Physics(interfaces.Physics, ABC):
         return tuple(self._models if self._model_of == self._built else self._model_of)
 
     @property
+    def own_models(self) -> Sequence[mujoco.MjModel]:
+        """Models from which those of the episodes are made, each once."""
+        return tuple({id(model): model for model in self._built}.values())
+
+    @property
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model of the first world."""
         return self._models[0]

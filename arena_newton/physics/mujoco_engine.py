@@ -151,6 +151,15 @@ class MujocoPhysics(Physics):
         d.qpos[:], d.qvel[:] = qpos, qvel
         self._publish(world, d)
 
+    def follow(self, data: Sequence[mujoco.MjData]) -> None:
+        """Take over what a tick has left of other copies of the worlds, one `MjData` each: state, contacts, latch."""
+        for w, given in enumerate(data):
+            mujoco.mj_copyData(self._data[w], self._model_of[w], given)
+            self._publish(w, self._data[w])
+            if self.scene.latch is not None:
+                self._host["latch"][w] = given.eq_active[self.scene.latch.equality]
+        self._read_contacts()
+
     def mj_step_only(self) -> None:
         """See `Physics.mj_step_only`."""
         self._each(self._solve_worlds, np.arange(self.worlds))

@@ -5,7 +5,6 @@ Vectors over the 29 body joints are in MuJoCo order unless the name says otherwi
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 __all__ = [
     "ANKLES",
@@ -135,7 +134,7 @@ class DriveGains:
     armature: tuple[float, ...] | None = None
     """Rotor inertia of the body joints [kg·m²], 29; None: the scene's, which is that of Unitree's model."""
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Fields by name, rotor inertia only where it is declared."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 
-def atan2(y: Tensor, x: Tensor, *, out: Tensor | None = None) -> Tensor:
+def atan2(y: Tensor, x: Tensor) -> Tensor:
     """Angle of (x, y) [rad], elementwise; the same bits whatever the number of elements.
 
     On the CPU torch computes contiguous elements in blocks of 8 or more, with other last bits than those that are left
@@ -42,9 +42,9 @@ def atan2(y: Tensor, x: Tensor, *, out: Tensor | None = None) -> Tensor:
     """
     one_by_one = y.numel() < 8 or (y.dim() == 1 and y.stride(0) > 1 and x.stride(0) > 1)
     if y.is_cuda or (y.shape == x.shape and one_by_one):
-        return torch.atan2(y, x, out=out)
+        return torch.atan2(y, x)
     pair = torch.stack(torch.broadcast_tensors(y, x), dim=-1)
-    return torch.atan2(pair[..., 0], pair[..., 1], out=out)
+    return torch.atan2(pair[..., 0], pair[..., 1])
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

@@ -173,4 +173,6 @@ def register(mode: Mode) -> None:
     _MODES.register(mode.name, mode)
 
 
-unregister = _MODES.unregister
+def unregister(name: str) -> None:
+    """Take back a mode that was offered in this process, if there is one."""
+    _MODES.unregister(name)

@@ -131,9 +131,9 @@ class _Trial:
             return torch.tensor(values if ticks else values[:, 0], dtype=torch.float32, device=self.device)
 
         def command(*ticks: int) -> TrackerCommand:
-            made = TrackerCommand(*(stacked(key, *ticks) for key in ("mimic", "joints", "joint_vel", "target_quat")))
-            made.position = stacked("reference_position", *ticks) if "position" in needs else None
-            return made
+            mimic, joints, vel, quat = (stacked(n, *ticks) for n in ("mimic", "joints", "joint_vel", "target_quat"))
+            position = stacked("reference_position", *ticks) if "position" in needs else None
+            return TrackerCommand(mimic, joints, vel, quat, position)
 
         now = command()
         state = RobotState(*(stacked(key) for key in ("quat", "ang_vel", "joint_pos", "measured_vel")))

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 
 from arena_newton import trackers
-from arena_newton.differentiable import EngineStep
+from arena_newton.differentiable import EngineStep, closed_loop
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.bench.bench_tick import as_before
 from arena_newton.eval.bench.timing import BenchFigure
@@ -24,6 +24,8 @@ TASKS = ("football", "vis_navi")
 WORLDS = (1, 16)
 BARE = 25
 """Bare ticks of a round: one is too short for the clock."""
+LOOP = 50
+"""Ticks of a closed loop whose memory is measured, in one part or in two."""
 
 
 def gradient_figures(rounds: int) -> Iterator[BenchFigure]:
@@ -31,6 +33,12 @@ def gradient_figures(rounds: int) -> Iterator[BenchFigure]:
     for task in TASKS:
         for worlds in WORLDS:
             yield from _figures(task, worlds, rounds)
+    env = ArenaEnv("football", tracker=trackers.get("twist2"), worlds=1, rules="released", engine="mujoco")
+    plan = torch.tensor(STAND_ACTION).double().repeat(1, LOOP, 1).requires_grad_()
+    for checkpoint, which, bar in ((None, "", 100.0), (LOOP // 2, f", checkpoints of {LOOP // 2} ticks", 10.0)):
+        kept = closed_loop(env, plan, [0], LOOP, checkpoint=checkpoint).memory / 1e3
+        yield BenchFigure(f"memory of a closed loop per tick, twist2, 1 world{which}", bar, "kB", True, kept)
+    env.close()
 
 
 def _figures(task: str, worlds: int, rounds: int) -> Iterator[BenchFigure]:

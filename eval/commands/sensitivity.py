@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from arena_newton.cli.flags import Several
 from arena_newton.cli.intervals import wilson
@@ -16,6 +16,7 @@ from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.files.text import counted
 
 if TYPE_CHECKING:
+    from arena_newton.eval.plan.config import RunConfig
     from arena_newton.eval.play.factories import Factories
     from arena_newton.eval.studies.placement_axes import Axis
     from arena_newton.eval.studies.placement_files import PointTally
@@ -33,9 +34,15 @@ class SensitivityOptions(PlacementOptions):
     """Map success and margin of a policy over the placements of a task: a grid over one or two numbers.
 
     At every point the same seeds are played (common random numbers), so that neighbours differ by the placement alone.
-    Needs the extra [plots].
+    Needs the extra [plots]. `--method adjoint` gives slopes of one episode's margin instead, to every placement, mass,
+    friction and gain, from one play and one backward run (engine mujoco).
     """
 
+    method: Literal["grid", "adjoint"] = "grid"
+    """A grid of episodes, or the exact slopes of one."""
+    reach: Several[float] = (0.001, 0.01)
+    """With `--method adjoint`, the two scales at which differences must not contradict a slope: metres, radians or
+    fractions of a factor."""
     grid: Several[int] = (7, 7)
     """Points along each axis, the ends of its range among them."""
     out: str | None = None
@@ -59,6 +66,8 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
     from arena_newton.eval.tables.suite_figures import save
 
     config, all_axes = placement_run(options)
+    if options.method == "adjoint":
+        return _adjoint(options, config, all_axes, factories)
     axes = all_axes if options.axes else _widest(all_axes)
     if len(axes) > MOST_AXES:
         raise InputError(f"--axes {' '.join(options.axes)}: a map has one or two")
@@ -85,6 +94,28 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
     print("\n".join(summary(axes, found)))
     print(f"written: {folder / 'sensitivity.png'}, sensitivity.csv, sensitivity.json, episodes.csv")
     return 1 if any(one.errors for one in found) else 0
+
+
+def _adjoint(options: SensitivityOptions, config: RunConfig, axes: Sequence[Axis], factories: Factories | None) -> int:
+    """Write and print the slopes of one episode."""
+    from arena_newton.eval.play.factories import Factories
+    from arena_newton.eval.studies.adjoint_slopes import play_slopes
+    from arena_newton.eval.studies.placed_play import PlacedWorlds
+    from arena_newton.eval.studies.placement_files import study_folder
+    from arena_newton.rules.modes import DYNAMICS
+
+    scales = options.reach
+    if len(scales) != 2 or not 0.0 < scales[0] < scales[1]:
+        shown = " ".join(f"{scale:g}" for scale in scales)
+        raise InputError(f"--reach {shown}: expected two scales, the smaller first")
+    if options.repeats != 1 or options.latency_ticks:
+        raise InputError("--method adjoint: one episode without latency has slopes, not --repeats or --latency-ticks")
+    smooth = [axis for axis in axes if not axis.counts and axis.record != DYNAMICS]
+    with PlacedWorlds(config, smooth, factories) as worlds:
+        folder = study_folder(options.out, "slopes", config.flags.task[0], options.tracker, options.mode)
+        print("\n".join(play_slopes(options, scales, worlds, folder, factories or Factories())))
+    print(f"written: {folder / 'slopes.csv'}, slopes.json, episodes.csv")
+    return 0
 
 
 def _widest(axes: Sequence[Axis]) -> tuple[Axis, ...]:

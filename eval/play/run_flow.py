@@ -70,8 +70,10 @@ def reported(folder: ResultsFolder, seconds: float) -> int:
 
 
 def command(folder: ResultsFolder, name: str) -> str:
-    """The command line that does something to a folder."""
-    return shell_command("arena_newton.eval", name, folder.path)
+    """The command line that does something to a folder; a program that decides must be named again."""
+    policy = folder.config.flags.policy
+    again = ("--policy", policy) if name == "resume" and policy.startswith("process:") else ()
+    return shell_command("arena_newton.eval", name, folder.path, *again)
 
 
 def groups(episodes: Iterable[Episode]) -> dict[Group, list[Episode]]:

@@ -23,6 +23,7 @@ from arena_newton.eval.studies.placement_axes import Axis, axes_of, chosen, move
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.interfaces import EpisodeResult, Planned, World
 from arena_newton.rollout import Rollout
+from arena_newton.tasks.base import Sample
 
 __all__ = ["MOST_EPISODES", "PlacedEpisode", "PlacedWorlds", "placement_run"]
 
@@ -152,6 +153,12 @@ class PlacedWorlds:
 
     def _samples(self, placed: Planned) -> dict[str, dict[str, float]]:
         assert isinstance(placed, PlacedEpisode)
-        mode = self.config.flags.mode[0]
-        drawn = self._spec.drawn(placed.episode_seed, mode, self._rules)
-        return moved(drawn, self.axes, placed.values, self._rules, mode)
+        return self.sampled(placed.episode_seed, placed.values)
+
+    def drawn(self, seed: int) -> dict[str, Sample]:
+        """Samples of an episode as its seed draws them."""
+        return self._spec.drawn(seed, self.config.flags.mode[0], self._rules)
+
+    def sampled(self, seed: int, values: Sequence[float]) -> dict[str, Sample]:
+        """The same with the axes at other values."""
+        return moved(self.drawn(seed), self.axes, values, self._rules, self.config.flags.mode[0])

@@ -1,4 +1,4 @@
-"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policies.md).
+"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policy_server.md).
 
 A server of that protocol knows one robot only, so there is one request per world. `from_spec` also knows the protocols
 of other servers (docs/asking_servers.md), each in its own module `remote_*`.

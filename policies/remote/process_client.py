@@ -1,4 +1,4 @@
-"""The policy that is a program of this machine: JSON lines on its standard input and output (docs/policies.md).
+"""The policy that is a program of this machine: JSON lines on its standard input and output (docs/policy_server.md).
 
 The messages are those of the original's HTTP protocol; one program answers for all worlds, one query after the other.
 """

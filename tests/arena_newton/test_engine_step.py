@@ -147,6 +147,7 @@ IMPLICIT = "<option integrator='implicitfast'/>"
 TENDON = "<tendon><fixed><joint joint='j' coef='1'/></fixed></tendon>"
 MOTOR = "<actuator><motor joint='j'/></actuator>"
 SLOW = "<actuator><position joint='j' timeconst='.1'/></actuator>"
+ROUND = "<option integrator='implicitfast' cone='elliptic'/>"
 AIR = "<option integrator='implicitfast' density='1.2'/>"
 
 
@@ -158,6 +159,7 @@ AIR = "<option integrator='implicitfast' density='1.2'/>"
         (IMPLICIT + JOINT + MOTOR, "actuator 0, not a joint's position drive"),
         (IMPLICIT + JOINT + SLOW, "an activation state"),
         (AIR + JOINT + DRIVE, "a fluid"),
+        (ROUND + JOINT + DRIVE, "elliptic friction cones"),
     ],
 )
 def test_a_model_with_parts_that_have_no_gradient(parts, words):
@@ -168,7 +170,7 @@ def test_a_model_with_parts_that_have_no_gradient(parts, words):
 
 
 def test_what_else_has_no_gradient():
-    """Engine `warp`, unknown parameters and prims, forces from outside and other shapes are refused by name."""
+    """Engine `warp`, unknown parameters and prims, outer forces, other shapes and factors are refused by name."""
     built = scene("football")
     physics = make_physics(built, RATE, "mujoco")
     with pytest.raises(InputError, match="engine warp has no gradient here: use engine mujoco"):
@@ -182,6 +184,8 @@ def test_what_else_has_no_gradient():
     state = step.state()
     with pytest.raises(InputError, match=r"targets of shape \[1, 29\], not \[1, 43\]"):
         step(state, torch.zeros(1, 29))
+    with pytest.raises(InputError, match="a factor of the model is not above 0"):
+        EngineStep(physics, ["kp"])(state, torch.zeros(1, 43), torch.zeros(1, 1))
     physics.external_force.assign(np.ones((1, physics.nbody, 6), np.float32))
     with pytest.raises(InputError, match="an external force acts on a body"):
         step.state()

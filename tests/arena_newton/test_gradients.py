@@ -15,6 +15,7 @@ from arena_newton.differentiable import (
     RollingBall,
     ball_flight,
     central_differences,
+    cross_entropy,
     play,
     reference_step,
 )
@@ -154,6 +155,16 @@ def test_differences_of_a_known_function():
         torch.testing.assert_close(found.bend, torch.tensor([0.2, 0.2], dtype=torch.float64))
         assert asked == [rows] * -(-5 // rows)
         assert found.value == pytest.approx(4.0)
+
+
+def test_the_cross_entropy_method_finds_a_minimum():
+    """The mean of its best moves to the minimum of a quadratic; every generation has as many draws as were asked."""
+    torch.manual_seed(0)
+    wanted = torch.tensor([0.3, -0.5], dtype=torch.float64)
+    search = cross_entropy(lambda points: (points - wanted).square().sum(1), 0.0 * wanted, 0.5, draws=60)
+    *_, (mean, values) = (next(search) for _ in range(12))
+    assert values.shape == (60,)
+    torch.testing.assert_close(mean, wanted, atol=1e-2, rtol=0.0)
 
 
 def test_a_kink_tells_itself():

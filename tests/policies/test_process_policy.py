@@ -208,6 +208,11 @@ def test_runs_with_a_program(program, tmp_path, monkeypatch, capsys):
     assert main([*run, "--out", str(tmp_path / "b")], factories(policy=policies.get)) == 2
     assert "policy_file" in capsys.readouterr().err
     assert main([*run, "--out", str(tmp_path / "c")], factories(policy=policies.get)) == 2
-    assert "the program is gone" in (said := capsys.readouterr().err) and "resume" in said
+    assert "the program is gone" in (said := capsys.readouterr().err)
+    assert f"eval resume {tmp_path / 'c'} --policy 'process:" in said
+    program("open(os.environ['TOLD'] + ' again', 'w')")
+    assert main(["resume", str(tmp_path / "c")], factories(policy=policies.get)) == 2
+    assert "a program played it, which a folder does not start; name it by --policy" in capsys.readouterr().err
+    assert not (tmp_path / "told again").exists()
     assert main([*run, "--remote-retries", "1"], factories(policy=policies.get)) == 2
     assert capsys.readouterr().err.startswith("error: --remote-retries: belongs to --policy remote:<url>, not process:")

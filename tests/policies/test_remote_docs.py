@@ -1,4 +1,4 @@
-"""Statements of docs/policies.md hold: its tables, its server, its policy in Python."""
+"""Statements of docs/policies.md and docs/policy_server.md hold: tables, the server, the policy in Python."""
 
 import re
 import threading
@@ -24,9 +24,9 @@ from arena_newton.policies.remote.arena_client import (
 from arena_newton.robot import canonical, g1
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "docs" / "policies.md").read_text()
+TEXT = "".join((ROOT / "docs" / page).read_text() for page in ("policies.md", "policy_server.md"))
 PLAIN = " ".join(TEXT.split())
-BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+SQUAT, *_, SERVER = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
 def table(title):
@@ -119,12 +119,12 @@ def test_request_tables():
 
 def test_server_of_the_text(monkeypatch):
     """The server is the file that it names, explains itself, and its noise follows from seed and step alone."""
-    assert (ROOT / "policies" / "serve_example.py").read_text().endswith(BLOCKS[0])
+    assert (ROOT / "policies" / "serve_example.py").read_text().endswith(SERVER)
     monkeypatch.setattr("sys.argv", ["serve_example", "--help"])
     with pytest.raises(SystemExit, match="0"):
-        exec(compile(BLOCKS[0], "docs/policies.md", "exec"), {"__name__": "__main__"})
+        exec(compile(SERVER, "docs/policy_server.md", "exec"), {"__name__": "__main__"})
     names = {"__name__": "server"}
-    exec(compile(BLOCKS[0], "docs/policies.md", "exec"), names)
+    exec(compile(SERVER, "docs/policy_server.md", "exec"), names)
     names["Handler"].log_message = lambda *_: None
     server = names["Server"](("127.0.0.1", 0), names["Handler"])
     threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
@@ -149,7 +149,7 @@ def test_server_of_the_text(monkeypatch):
 def test_policy_in_python(monkeypatch):
     """The policy of the text runs, found by its name."""
     names = {}
-    exec(compile(BLOCKS[1], "docs/policies.md", "exec"), names)
+    exec(compile(SQUAT, "docs/policies.md", "exec"), names)
     monkeypatch.setattr(policies.base.POLICIES, "_registered", {})
     policies.register("squat", names["Squat"])
     policy = policies.get("squat:0.2")
@@ -160,14 +160,3 @@ def test_policy_in_python(monkeypatch):
     policy.reset([1, 2], ["Isaac-Boxing"] * 2, np.array([False, True]))
     chunk = policy.act(observation(2)).actions
     assert chunk[1, 0, 2] == np.float32(0.8) and chunk[0, 0, 2] < 0.8
-
-
-def test_links_of_the_text():
-    """Files and headings that the text links to exist."""
-    headings = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.*)$", TEXT, re.M)}
-    for target in re.findall(r"\]\(([^)]+)\)", TEXT):
-        file, _, heading = target.partition("#")
-        if file:
-            assert (ROOT / "docs" / file).is_file(), target
-        else:
-            assert heading in headings, target

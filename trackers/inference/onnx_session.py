@@ -76,12 +76,19 @@ class OnnxSession(torch.nn.Module):
     def convert(self, device: torch.device) -> None:
         """Let torch modules run the rows of a GPU, where `onnx_mlp` can read the file; undo it for the CPU."""
         self.twin = None
-        if device.type == "cpu":
-            return
+        if device.type != "cpu":
+            with contextlib.suppress(InputError):
+                self.twin = self.as_torch()
+
+    def as_torch(self) -> torch.nn.Module:
+        """The network as torch modules, float32, on the CPU.
+
+        Raises:
+            InputError: `onnx_mlp` cannot read the file.
+        """
         from arena_newton.trackers.inference import onnx_mlp
 
-        with contextlib.suppress(InputError):
-            self.twin = onnx_mlp.load(self.path, in_width=self.in_width, out_width=self.out_width)
+        return onnx_mlp.load(self.path, in_width=self.in_width, out_width=self.out_width)
 
     def _run(self, rows: np.ndarray) -> np.ndarray:
         """All rows, in parts of the size that the file fixes, if it fixes one."""

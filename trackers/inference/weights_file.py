@@ -204,7 +204,8 @@ def drive(value: Mapping[str, Any]) -> DriveGains:
     for name, number in fingers.items():
         if not (math.isfinite(number) and number >= 0.0):
             raise ValueError(f"drive {name} is {number}, expected a finite number of at least 0")
-    return DriveGains(**{"name": str(value["name"]), **vectors, **fingers})
+    fields: dict[str, Any] = {"name": str(value["name"]), **vectors, **fingers}
+    return DriveGains(**fields)
 
 
 def physics(value: Mapping[str, Any]) -> PhysicsRate:

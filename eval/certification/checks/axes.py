@@ -284,9 +284,9 @@ def dynamics(context: Context) -> CheckFinding:
             if (base.placed, base.light) != (other.placed, other.light):
                 broken.append(f"{task}: episode seed {seed} has other placements or lights than in base mode")
                 break
-        found = context.measured(
-            name, task, context.trackers[0], {}, functools.partial(_stand, context, task, context.trackers[0])
-        )
+        measure = functools.partial(_stand, context, task, context.trackers[0])
+        found = context.measured(name, task, context.trackers[0], {}, measure)
+        assert isinstance(found, list)
         broken += [f"{task}: {fault}" for fault in found]
     sheet = Table(("quantity", "unit", "range", f"drawn in {DRAWN_SEEDS} episodes"), rows, title="What the mode draws")
     summary = f"{len(rows)} quantities are drawn and act; with usual values every bit is that of base mode"
@@ -300,12 +300,12 @@ def _stand(context: Context, task: str, tracker: str) -> list[str]:
     ranges = modes.get(modes.DYNAMICS).dynamics
     alone = [key for key in ranges if key not in ("push_heading", "push_time")]
     env = world_of(context, task, tracker, worlds=2 + len(alone))
-    drawn = tasks.get(task).drawn(context.seeds(task, 1)[0], "base", env.rules.task(task))
+    drawn = tasks.get(task).drawn(context.seeds(task, 1)[0], "base", rule_sets.get("paper").task(task))
     usual = {key: quantity.usual for key, quantity in modes.QUANTITIES.items()}
     usual["push_time"] = PUSHED_AT / env.budget
     given = [{}, usual, *({**usual, key: ranges[key][1]} for key in alone)]
-    faults = []
-    built = env.physics.mj_model
+    faults: list[str] = []
+    built = env.physics.models[0]
     seeds = context.seeds(task, 1) * env.worlds
     env.reset(seeds, samples=[drawn | ({modes.DYNAMICS: sample} if sample else {}) for sample in given])
     for sample, model in zip(given, env.physics.models, strict=True):
@@ -323,7 +323,7 @@ def _stand(context: Context, task: str, tracker: str) -> list[str]:
         still = key == "object_mass"  # where no object moves, its mass changes nothing
         if (tick is None and not still) or (key == "push" and tick != env.startup_ticks + PUSHED_AT):
             faults.append(f"{key} acts from tick {tick} on")
-    return faults
+    return [*dict.fromkeys(faults)]
 
 
 def _strays(

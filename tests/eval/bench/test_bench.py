@@ -25,9 +25,9 @@ def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch
 
 def test_a_gradient_is_counted_in_bare_ticks(monkeypatch):
     """A tick backward is a judged multiple of a bare one, for each number of worlds; so is what it keeps."""
-    for name, value in (("TASKS", ("football",)), ("WORLDS", (1, 2)), ("BARE", 2)):
+    for name, value in (("TASKS", ("football",)), ("WORLDS", (1, 2)), ("BARE", 2), ("LOOP", 8)):
         monkeypatch.setattr(bench_gradients, name, value)
-    one, memory, two = bench_gradients.gradient_figures(1)
+    one, memory, two, loop, parts = bench_gradients.gradient_figures(1)
     for figure, worlds in ((one, "1 world"), (two, "2 worlds")):
         assert (
             figure.value > 1.0
@@ -35,6 +35,7 @@ def test_a_gradient_is_counted_in_bare_ticks(monkeypatch):
             and figure.name == (f"a tick backward / bare tick, football, {worlds}, CPU")
         )
     assert 1.0 < memory.value < memory.bar and "forward" in one.note
+    assert 1.0 < parts.value < loop.value < loop.bar == 100.0 and parts.bar == 10.0
 
 
 def test_three_starts_with_two_caches(monkeypatch):

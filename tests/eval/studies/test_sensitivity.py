@@ -175,3 +175,28 @@ def test_samples_place_what_the_seed_would(tmp_path):
     with pytest.raises(InputError, match="1 samples for 2 worlds"):
         env.reset([5, 5], samples=[drawn])
     env.close()
+
+
+def test_slopes_of_an_episode(tmp_path, capsys):
+    """`--method adjoint` writes the exact slope to each placement and factor beside differences."""
+    flags = "--task football --policy stand --rules released --engine mujoco --fast-physics --max-steps 2"
+    assert main(["sensitivity", "--method", "adjoint", *flags.split(), "--out", str(tmp_path / "out")]) == 0
+    found = {one["number"]: one for one in rows(tmp_path / "out" / "slopes.csv")}
+    assert list(found)[:2] == ["football.x", "football.y"] and "mass:/World/Ball" in found
+    ahead = found["football.y"]
+    assert ahead["worth"] == "holds" and abs(float(ahead["slope"])) > 0.1
+    for column in ("differences at 0.001", "differences at 0.01", "policy acts again"):
+        assert float(ahead[column]) == pytest.approx(float(ahead["slope"]), abs=2e-3), column
+    told = json.loads((tmp_path / "out" / "slopes.json").read_text())
+    assert (told["outcome"], told["ticks"], told["policy_has_gradient"]) == ("timeout", 2, False)
+    assert "actions are constants" in capsys.readouterr().out
+
+
+def test_unfit_flags_of_slopes(capsys):
+    """Scales in the wrong order, repeats and latency are refused before anything is played."""
+    for flags, words in (
+        (["--reach", "0.01", "0.001"], "--reach 0.01 0.001: expected two scales, the smaller first"),
+        (["--repeats", "2"], "--method adjoint: one episode without latency has slopes"),
+    ):
+        assert main(["sensitivity", "--method", "adjoint", "--task", "football", *flags]) == 2
+        assert words in capsys.readouterr().err

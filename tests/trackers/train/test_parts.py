@@ -1,4 +1,4 @@
-"""Parts of the training that need no physics."""
+"""Parts of the training, nearly all without physics."""
 
 import dataclasses
 import math
@@ -9,6 +9,7 @@ import torch
 
 from arena_newton.errors import InputError
 from arena_newton.robot import rotations
+from arena_newton.trackers import interface
 from arena_newton.trackers.motions import kinematics
 from arena_newton.trackers.train import __main__ as command_line
 from arena_newton.trackers.train import session
@@ -19,6 +20,9 @@ from arena_newton.trackers.train.terms import events
 from arena_newton.trackers.train.terms.measurement import TickMeasurement, TrainingError
 from arena_newton.trackers.train.terms.rewards import REWARDS, configured, maximum
 from arena_newton.trackers.train.terms.terminations import TERMINATIONS
+from arena_newton.trackers.train.tracker_env import TrackerEnv
+from arena_newton.trackers.train.train_options import TrainOptions
+from arena_newton.trackers.twist2 import Twist2FrontEnd
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +204,33 @@ def test_a_training_says_first_what_it_builds(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr()
     assert said.out == "generating references, then building 16 worlds on cpu ...\n"
     assert said.err == "error: 16 worlds\n"
+
+
+class ForeseeingFrontEnd(Twist2FrontEnd):
+    """TWIST2's front end that is given state estimation and a window, and keeps what it is given."""
+
+    needs, lookahead = ("position", "lin_vel"), 3
+
+    def write(self, command, state):
+        super().write(command, state)
+        self.given = command, state
+
+
+def test_declared_fields_are_given_in_training(library):
+    """A front end with a window gets the next frames of its clip, its last one repeated, and exact state estimation."""
+    foreseeing = dataclasses.replace(interface.get("twist2"), front_end=ForeseeingFrontEnd)
+    form = foreseeing.action_form("auto")
+    env = TrackerEnv(foreseeing, form, library.to("cpu"), TrainOptions(worlds=2, randomise=False))
+    last = env.bank.start + env.bank.length - 1
+    env.reset(torch.stack([env.bank.start[0], last[0] - 3]))
+    command, state = env.front_end.given
+    assert torch.equal(state.position, env.sim.root_pos) and torch.equal(state.lin_vel, env.sim.root_vel)
+    for world, frame in enumerate(env.frame):
+        later = torch.minimum(frame + torch.arange(1, 5), env.bank.last[frame])
+        reference = env.bank.gather(later)
+        assert torch.equal(command.position[world], reference.root_pos[0])
+        assert torch.equal(command.ahead.joints[world], reference.joint_pos[1:])
+        assert torch.equal(command.ahead.position[world], reference.root_pos[1:])
+    blind = dataclasses.replace(foreseeing, front_end=type("Feet", (Twist2FrontEnd,), {"needs": ("foot_force",)}))
+    with pytest.raises(InputError, match="'twist2': needs foot_force, which training does not measure"):
+        TrackerEnv(blind, form, library.to("cpu"), TrainOptions(worlds=2))

@@ -59,7 +59,7 @@ def stand(tracker: Tracker, *, engine: str = "auto", device: str | None = None) 
     height, mean, worst = float(lowest), float(error.mean()), float(error.max())
     joint = MUJOCO_JOINTS[int(error.argmax())]
     turned, commanded = (measures[name] for name in ("speed_yaw", "ref_yaw"))
-    fell, declared = bool(measures["fell"][cell > 0].any()), "root orientation" in tracker.ignores
+    fell, declared = bool(measures["fell"][cell > 0].any()), "root orientation" in getattr(tracker, "ignores", ())
     followed = 0.0 if fell else np.subtract(*_sides(turned, cell)) / np.subtract(*_sides(commanded, cell))
     turn = "the robot falls" if fell else f"{100 * followed:.0f} % of a turn is followed"
     turn += f", expected {100 * FOLLOWED:.0f} % or more"

@@ -7,7 +7,7 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.__main__ import main
-from arena_newton.trackers.evaluation import stand as standing
+from arena_newton.trackers.evaluation import stand_check
 
 CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
 
@@ -38,10 +38,10 @@ def with_wrong_scale(tracker):
 )
 def test_mistakes_show(monkeypatch, spoil, broken):
     """SONIC stands and turns; a default pose, a turn or a scale of the wrong sign breaks the measure that names it."""
-    monkeypatch.setattr(standing, "ROLLOUTS", 1)
+    monkeypatch.setattr(stand_check, "ROLLOUTS", 1)
     tracker = trackers.get("sonic")
     spoil(tracker)
-    results = {result.name: result for result in standing.stand(tracker, device="cpu")}
+    results = {result.name: result for result in stand_check.stand(tracker, device="cpu")}
     assert {name for name, result in results.items() if not result.ok} == broken, results
     assert ("?" in results["turn"].message) == ("turn" in broken)
     if spoil is with_wrong_pose:
@@ -50,7 +50,7 @@ def test_mistakes_show(monkeypatch, spoil, broken):
 
 def test_doctor_prints_it(monkeypatch, capsys):
     """`doctor --tracker NAME --stand` adds the measures to the promises; one that fails makes the exit code 1."""
-    monkeypatch.setattr(standing, "ROLLOUTS", 1)
+    monkeypatch.setattr(stand_check, "ROLLOUTS", 1)
     assert main(["doctor", "--tracker", "pd", "--stand"]) == 1
     shown = capsys.readouterr().out
     assert "keeps all 13 promises" in shown and "! pelvis" in shown and "0.6 m or more" in shown
