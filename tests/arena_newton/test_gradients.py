@@ -280,13 +280,17 @@ def test_worlds_differ_by_their_actions_alone():
 
 
 def test_the_documented_programs_run():
-    """The blocks of docs/gradients.md give finite slopes: of a tick, and of a step ahead and a lower stance."""
+    """The blocks of docs/gradients.md give finite slopes: of a tick, of a closed loop, of a step and a lower stance."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "gradients.md").read_text()
-    tick, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
+    tick, loop, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
     world: dict = {"__name__": "docs_gradients"}
     exec(compile(tick, "docs/gradients.md", "exec"), world)
     for leaf in (world["targets"], world["factors"]):
         assert leaf.grad.isfinite().all() and leaf.grad[0].abs().max() > 0.0
+    exec(compile(loop, "docs/gradients.md", "exec"), world)
+    for leaf in (world["plan"], world["qpos"], world["rolled"].factors):
+        assert leaf.grad.isfinite().all()
+    assert world["qpos"].grad.abs().max() > 0.1
     exec(compile(estimate, "docs/gradients.md", "exec"), world)
     found = world["found"]
     assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
