@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arena_newton.cli.flags import Device, Several, bounds
+from arena_newton.eval.plan.options import QUICK_TRACKERS
 
 __all__ = [
     "CameraBenchOptions",
@@ -191,7 +192,7 @@ class GradientBenchOptions(PlainBenchOptions):
 
     tasks: Several[str] = ()
     """Tasks; all that have an expert when none are named."""
-    trackers: tuple[str, ...] = ("twist2", "sonic")
+    trackers: Several[str] = QUICK_TRACKERS
     """Trackers, whose drives differ."""
     states: int = field(default=20, metadata=bounds(2, 10_000))
     """States of each task and tracker."""

@@ -26,7 +26,7 @@ def main() -> None:
     truth = torch.exp(0.2 * (2 * torch.rand(len(NAMES)).double() - 1))  # the other robot is within 20 % of the model
     walk = (torch.tensor(canonical.STAND_ACTION) + 0.008 * torch.eye(40)[0]).repeat(1, 10 * args.windows, 1)  # 0.4 m/s
     real = differentiable.closed_loop(one, walk, [3], walk.shape[1], parameters=NAMES, factors=truth[None])
-    for rows, order, noise in ((real.qpos, "joint_qpos", 0.0005), (real.qvel, "joint_qvel", 0.01)):  # rad, rad/s
+    for rows, order, noise in ((real.qpos, "joint_qpos", 0.0001), (real.qvel, "joint_qvel", 0.002)):  # rad, rad/s
         rows[..., getattr(one.scene.robot, order)] += noise * torch.randn(len(rows), 1, 29).double()
     step = differentiable.EngineStep(many.physics, NAMES)
     start = step.state()._replace(qpos=real.qpos[:-1:10, 0], qvel=real.qvel[:-1:10, 0])

@@ -54,7 +54,11 @@ class Agent:
             self.goal = here + near / np.linalg.norm(near) * (away.min() + 0.27)
         boxes = [[*block * CELL, 0.0, 0.1, 0.1] for block in self.blocks if math.dist(block * CELL, self.goal) > 0.5]
         start, end = (torch.tensor(point[None], dtype=torch.float32) for point in (here, self.goal))
-        path = plan(start, end, Floor(torch.tensor([boxes]).reshape(1, -1, 5), *ROOM)).points[0].tolist()
+        found = plan(start, end, Floor(torch.tensor([boxes]).reshape(1, -1, 5), *ROOM))
+        if found.clearance[0] == 0.0:
+            print("       sees no free path, looks again from nearer", file=sys.stderr)
+            found.points[0, :] = start + 0.15 * (end - start)
+        path = found.points[0].tolist()
         corner = next((point for point in path if math.dist(point, here) > 0.3), path[-1])
         return f"walk to {corner[0]:.2f} {corner[1]:.2f}"
 

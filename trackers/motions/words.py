@@ -48,7 +48,8 @@ class WordedMotion:
         """Begin an episode."""
         self.generator.reset()
         self._navigator.reset()
-        self._command, self._goal = MotionCommand.neutral(1), None
+        self._command = MotionCommand.neutral(1)
+        self._goal: torch.Tensor | None = None
         self.arrived = True
         """True once the last walk or turn is over."""
 

@@ -93,7 +93,7 @@ class Slopes(NamedTuple):
 
     @property
     def size(self) -> torch.Tensor:
-        """What a difference is a part of: the estimate, or the root mean square of all where that is larger."""
+        """Scale of a difference: the estimate, or the root mean square of all where that is larger."""
         return self.estimated.abs().clamp_min(float(self.estimated.square().mean().sqrt()))
 
     @property
