@@ -288,8 +288,9 @@ def test_the_documented_programs_run():
     for leaf in (world["targets"], world["factors"]):
         assert leaf.grad.isfinite().all() and leaf.grad[0].abs().max() > 0.0
     exec(compile(loop, "docs/gradients.md", "exec"), world)
-    leaves = world["plan"], world["qpos"], world["rolled"].factors
-    assert all(leaf.grad.isfinite().all() for leaf in leaves) and leaves[1].grad.abs().max() > 0.0
+    for leaf in (world["plan"], world["qpos"], world["rolled"].factors):
+        assert leaf.grad.isfinite().all()
+    assert world["qpos"].grad.abs().max() > 0.1
     exec(compile(estimate, "docs/gradients.md", "exec"), world)
     found = world["found"]
     assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
