@@ -105,6 +105,30 @@ def test_factors_of_the_model_over_a_run():
     torch.testing.assert_close(gradient[0], torch.stack(estimate), rtol=1e-3, atol=1e-5)
 
 
+def test_friction_moves_a_ball_that_hops_on_the_grass():
+    """A ball at rest hops on its two contacts: its height has the slope of differences in friction, none in mass."""
+    built = scene("football")
+    physics = stood(built, ticks=1)
+    names = ("friction", "mass:/World/Ball")
+    exact, precise = EngineStep(physics, names), EngineStep(physics, names, converged=True)
+    begin, targets = exact.state(), torch.from_numpy(physics.data[0].ctrl.copy())[None]
+    height, speed = built.joint_qpos("/World/Ball") + 2, built.joint_qvel("/World/Ball")
+    begin.qpos[0, height], begin.qvel[0, speed : speed + 6] = 0.11, 0.0
+
+    def ended(step, factors):
+        state = begin
+        for _ in range(3):
+            state = step(state, targets, factors)
+        return state.qpos[0, height]
+
+    factors = torch.ones(1, 2, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(ended(exact, factors), factors)
+    with torch.no_grad():
+        ends = [ended(precise, torch.tensor([[1 + side, 1.0]], dtype=torch.float64)) for side in (1e-7, -1e-7)]
+    assert float(gradient[0, 0]) == pytest.approx(float(ends[0] - ends[1]) / 2e-7, rel=1e-2)
+    assert abs(float(gradient[0, 1])) < 1e-6 * abs(float(gradient[0, 0]))
+
+
 def test_forward_is_the_engine_and_threads_change_nothing():
     """Ticks are the engine's bit for bit, factors of 1 included; one thread and two give equal bits and gradients."""
     built = load_scene("football", worlds=2, device="cpu", native=True)
