@@ -61,11 +61,15 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
         ({"dynamics": {"gains": (-0.1, 0.3)}}, "mode wet: gains: -0.1 to 0.3 is not a range of it"),
         ({"dynamics": {"friction": (NAN, 1.0)}}, "mode wet: friction: nan to 1 is not a range of it"),
         ({"dynamics": {"action_latency": (0, 1.5)}}, "mode wet: action_latency: 0 to 1.5 is not a range of it"),
+        ({"dynamics": {"action_latency": (0.5, 2)}}, "mode wet: action_latency: 0.5 to 2 is not a range of it"),
+        ({"dynamics": {"friction": (0.5, float("inf"))}}, "mode wet: friction: 0.5 to inf is not a range of it"),
+        ({"dynamics": {"object_mass": (0.0, 1.0)}}, "mode wet: object_mass: 0 to 1 is not a range of it"),
+        ({"dynamics": {"push_time": (0.5, 1.5)}}, "mode wet: push_time: 0.5 to 1.5 is not a range of it"),
         ({"dynamics": {"state_latency": (0, 11)}}, "mode wet: state_latency: 11, expected at most 10 ticks"),
     ],
 )
 def test_ranges_that_are_none_are_refused(change, message):
-    """An unknown quantity, reversed bounds, a fraction of a tick: one line that names mode and quantity."""
+    """An unknown quantity, reversed or endless bounds, no mass, a fraction of a tick, a time after the end: one line that names mode and quantity."""
     with pytest.raises(InputError, match=message):
         dataclasses.replace(WET, **change)
 
