@@ -215,8 +215,10 @@ def layers_hash(stage: Path) -> str:
     return config_hash(sorted(map(hash_path, validate.layers(stage))))
 
 
-def foreign_task(spec: TaskSpec) -> JsonObject:
+def foreign_task(spec: TaskSpec, modes: Collection[str] = ()) -> JsonObject:
     """Hashes of a task's scene, with all that it names, and of the packages of judge, sampler and expert, unless ours.
+
+    So are the layers by which some of the `modes` replace the scene.
 
     A kernel is hashed with the package of the judge that launches it.
     """
@@ -227,6 +229,8 @@ def foreign_task(spec: TaskSpec) -> JsonObject:
     facts: JsonObject = {"code": config_hash(sorted(filter(None, codes)))} if codes else {}
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
+        layers = {mode: layers_hash(layer) for mode in modes if (layer := spec.own_layer(mode)) is not None}
+        facts |= {"layers": layers} if layers else {}
     return facts
 
 
