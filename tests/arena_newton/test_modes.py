@@ -69,7 +69,7 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
     ],
 )
 def test_ranges_that_are_none_are_refused(change, message):
-    """An unknown quantity, bounds that are reversed or endless, no mass, part of a tick, a time after the end: one line."""
+    """An unknown quantity, reversed or endless bounds, no mass, part of a tick, a time after the end: one line."""
     with pytest.raises(InputError, match=message):
         dataclasses.replace(WET, **change)
 
