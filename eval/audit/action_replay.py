@@ -164,6 +164,7 @@ def _play(
             )
             raise InputError(f"--replay: {run.folder}: tracker {tracker} {seen}")
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
+    measured = made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
     for tracker in dict.fromkeys(record.tracker for record in records):
         actions = run.folder / actions_folder(stored.tracker, tracker)
@@ -189,7 +190,7 @@ def _play(
                         _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
                         totals.furthest = max([totals.furthest, *states.differences[index][1:]])
                     else:
-                        _compare(audit, lines[index], result, seen.taken(index)[1])
+                        _compare(audit, lines[index], result, seen.taken(index)[1], measured=measured)
                 for index, answers in seen.answers.items():
                     _judge_answers(audit, lines[index], answers, totals)
         finally:
@@ -270,11 +271,13 @@ def _note_differences(audit: Audit, config: RunConfig, keys: Sequence[str]) -> N
             audit.notes.append(note)
 
 
-def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str]) -> None:
-    """Hold an episode that was played again to its line."""
+def _compare(
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str], *, measured: bool
+) -> None:
+    """Hold an episode that was played again to its line; metrics too, where recorders are here (`measured`)."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
-    again |= {"extra": result.extra} if result.extra else {}
+    again |= {"extra": result.extra} if measured or result.extra else {}
     again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)
