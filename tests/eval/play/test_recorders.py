@@ -102,6 +102,14 @@ def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
     assert "expected a finite number with a name" in said and journal(tmp_path / "a") == {}
 
 
+def test_a_metric_of_any_size_has_its_figures(tmp_path):
+    """A metric that a float just holds is in the tables, though its sum and its square are too large."""
+    big = sys.float_info.max
+    assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=given("big", big))) == 0
+    for cell in json.loads((tmp_path / "a" / "results.json").read_text())["cells"]:
+        assert cell["extra"]["big"] == {"episodes": 4, "mean": big, "std": 0.0, "least": big, "most": big}
+
+
 def test_a_run_goes_on_with_its_recorders_alone(measured, tmp_path, monkeypatch, capsys):
     """A run that another program would measure otherwise is refused, since half of its lines would lack the metric."""
     lines = (measured / "episodes.jsonl").read_text().splitlines(keepends=True)
