@@ -159,10 +159,10 @@ def _play(
     plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
     for tracker in dict.fromkeys(record.tracker for record in records):
         if getattr(made.tracker(tracker, plan.checkpoint), "lookahead", 0):
-            seen = (
+            why = (
                 "reads the coming reference, which recorded actions do not hold: no replay can contradict its episodes"
             )
-            raise InputError(f"--replay: {run.folder}: tracker {tracker} {seen}")
+            raise InputError(f"--replay: {run.folder}: tracker {tracker} {why}")
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
     measured = made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
