@@ -287,7 +287,14 @@ class ConditionsJudge(Judge):
             conditions: As of `Judge`.
             success: Conditions of success.
             ticks: Ticks in a row for which all of them must hold.
+
+        Raises:
+            InputError: No condition of success, one that is itself made of success, or no tick.
         """
+        if not success or any(condition.kind == "margin" for condition in success):
+            raise InputError(f"{scene.path}: success needs conditions, and none of the kind margin, which it gives")
+        if ticks < 1:
+            raise InputError(f"{scene.path}: success for {ticks} ticks, expected at least 1")
         super().__init__(scene, predicates, conditions)
         self._success, self._ticks, self._held = self.table(success), ticks, self.counter()
         del self._success["first"]  # one conjunction

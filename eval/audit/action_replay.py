@@ -98,8 +98,8 @@ def replay(
         tick_tolerance: Largest distance of a body after a tick of another engine [m].
 
     Raises:
-        InputError: They were played on another engine and no states were recorded, are demonstrations, or cannot be
-            played here.
+        InputError: They were played on another engine and no states were recorded, are demonstrations, were played
+            through a tracker with a lookahead, or cannot be played here.
     """
     run, made = audit.run, factories or Factories()
     stored, where = stored_options(run.folder), f"--replay: {run.folder}"
@@ -157,7 +157,14 @@ def _play(
     """Play these episodes of a folder's plan, and compare each."""
     run, wanted = audit.run, {_key(record): record for record in records}
     plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
+    for tracker in dict.fromkeys(record.tracker for record in records):
+        if getattr(made.tracker(tracker, plan.checkpoint), "lookahead", 0):
+            why = (
+                "reads the coming reference, which recorded actions do not hold: no replay can contradict its episodes"
+            )
+            raise InputError(f"--replay: {run.folder}: tracker {tracker} {why}")
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
+    measured = made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
     for tracker in dict.fromkeys(record.tracker for record in records):
         actions = run.folder / actions_folder(stored.tracker, tracker)
@@ -183,7 +190,7 @@ def _play(
                         _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
                         totals.furthest = max([totals.furthest, *states.differences[index][1:]])
                     else:
-                        _compare(audit, lines[index], result, seen.taken(index)[1])
+                        _compare(audit, lines[index], result, seen.taken(index)[1], measured=measured)
                 for index, answers in seen.answers.items():
                     _judge_answers(audit, lines[index], answers, totals)
         finally:
@@ -264,11 +271,13 @@ def _note_differences(audit: Audit, config: RunConfig, keys: Sequence[str]) -> N
             audit.notes.append(note)
 
 
-def _compare(audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str]) -> None:
-    """Hold an episode that was played again to its line."""
+def _compare(
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, evidence: dict[str, str], *, measured: bool
+) -> None:
+    """Hold an episode that was played again to its line; metrics too, where recorders are here (`measured`)."""
     margin = float(result.margin) if math.isfinite(result.margin) else None
     again = {name: getattr(result, name) for name in COMPARED} | {"margin": margin}
-    again |= {"extra": result.extra} if result.extra else {}
+    again |= {"extra": result.extra} if measured or result.extra else {}
     again |= {name: evidence.get(name) for name in EVIDENCE if getattr(record, name) is not None}
     for name, value in again.items():
         was = getattr(record, name)

@@ -392,10 +392,12 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_hash=policy_hash,
         rules_hash=rule_set.hash_for(tasks),
         variant_hash=variant_hash,
-        scenes_hash=scenes_hash(tasks, task_specs.names(), flags.mode),
+        scenes_hash=scenes_hash(tasks, task_specs.OWN, flags.mode),
         code_hash=code_hash(),
         mode_facts={name: facts for name in flags.mode if (facts := mode_facts(name, rule_set, tasks))},
-        foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name)))},
+        foreign_tasks={
+            name: facts for name in tasks if (facts := foreign_task(task_specs.get(name), sorted(flags.mode)))
+        },
     )
 
 

@@ -72,7 +72,7 @@ def facts_of(
         "checkpoint": config.checkpoint_hashes[tracker],
         "tracker_facts": (config.tracker_facts or {}).get(tracker),
         "rules_hash": rule_sets.get(flags.rules).hash_for((task,)),
-        "scenes": scenes_hash((task,), task_specs.names(), (mode,)),
+        "scenes": scenes_hash((task,), task_specs.OWN, (mode,)),
         "environment": comparable(environment),
         "versions": moving_versions(dict(versions)) | {"av": av.__version__},
         **({"mode_facts": own} if own else {}),

@@ -286,7 +286,8 @@ class RunPlayer:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
             own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()} | shown_by(config.cameras)
             research = self.factories.recorders(env)
-            own |= {"recorders": config_hash(sorted({own_code(one) or "" for one in research}))} if research else {}
+            measuring = (self.factories.recorders, *research) if research else ()  # numbers may stand in either
+            own |= {"recorders": config_hash(sorted({own_code(one) or "" for one in measuring}))} if measuring else {}
             for names in groups(order):
                 facts = self.folder.register(" ".join(names), own)
             if flags.verbose:
@@ -431,9 +432,14 @@ def _viewer(config: RunConfig, folder: Path) -> WorldViewer | None:
 
 def _metric(name: str, value: float) -> float:
     """A metric as the journal keeps it."""
-    if not is_name(name) or not math.isfinite(value):
-        raise InputError(f"recorder: metric {plain_text(name, 80)} is {value}, expected a finite number with a name")
-    return float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not is_name(name) or not math.isfinite(number):
+        shown = f"metric {plain_text(name, 80)} is {plain_text(value, 80)}"
+        raise InputError(f"recorder: {shown}, expected a finite number with a name")
+    return number
 
 
 def _record(

@@ -72,7 +72,10 @@ UNHASHED = (
 (`__main__.py`). All other code counts, whatever is added to the package."""
 UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
-
+UNRULED = (
+    "gym_id instruction spawn_position spawn_quat expert disturbance predicates target interaction recolour events"
+).split()
+"""Fields of a `TaskSpec` that change an episode or what is kept of it, and are not among the hashed rules."""
 
 LARGE_BYTES = 8 << 20
 """Size from which on a hash is kept [bytes]; nothing that is edited by hand is so large."""
@@ -184,8 +187,8 @@ def _running_code() -> str:
 def scene_files(root: Path, tasks: Collection[str], known: Collection[str], modes: Collection[str] = ()) -> list[Path]:
     """Layers, textures and what else is stored next to the built-in scenes of a run's tasks.
 
-    Of all `known` tasks the folders of those that the run lacks do not count, nor does the trackers' `lab`, nor what is
-    named after a held-out mode that is not among `modes`.
+    Of the `known` tasks, this package's, the folders of those that the run lacks do not count, nor does the trackers'
+    `lab`, nor what is named after a held-out mode that is not among `modes`.
     """
     others, unplayed = {"lab", *known} - set(tasks), set(all_modes.HELD_OUT) - set(modes)
     scenes = root / "usd_scenes"
@@ -215,18 +218,24 @@ def layers_hash(stage: Path) -> str:
     return config_hash(sorted(map(hash_path, validate.layers(stage))))
 
 
-def foreign_task(spec: TaskSpec) -> JsonObject:
+def foreign_task(spec: TaskSpec, modes: Collection[str] = ()) -> JsonObject:
     """Hashes of a task's scene, with all that it names, and of the packages of judge, sampler and expert, unless ours.
 
-    A kernel is hashed with the package of the judge that launches it.
+    A kernel is hashed with the package of the judge that launches it. A record that lends all of these from this
+    package is in none that is hashed: what its rules do not hold counts by itself. So do layers that replace the scene
+    in `modes`, which it does not name.
     """
     codes = {own_code(spec.judge), own_code(spec.sample)}
     if spec.expert is not None:
         codes.add(_package_code(spec.expert.partition(":")[0]))
     codes.discard(None)
     facts: JsonObject = {"code": config_hash(sorted(filter(None, codes)))} if codes else {}
+    if not codes and spec.scene is not None:
+        facts["record"] = config_hash([repr(getattr(spec, name)) for name in UNRULED])
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
+        layers = {mode: layers_hash(layer) for mode in modes if (layer := spec.own_layer(mode)) is not None}
+        facts |= {"layers": layers} if layers else {}
     return facts
 
 

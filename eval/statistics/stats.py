@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import statistics
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -209,9 +210,9 @@ def cell(records: Sequence[EpisodeRecord]) -> Figures:
 
 def _metric(records: Iterable[EpisodeRecord], name: str) -> MetricFigures:
     """Figures of a metric over the episodes that have it, one at least."""
-    values = [record.extra[name] for record in records if name in record.extra]
-    mean, least, most = math.fsum(values) / len(values), min(values), max(values)
-    return {"episodes": len(values), "mean": mean, "std": population_std(values), "least": least, "most": most}
+    values = [float(record.extra[name]) for record in records if name in record.extra]
+    mean, std = statistics.mean(values), statistics.pstdev(values)  # no sum on the way to them is too large for a float
+    return {"episodes": len(values), "mean": mean, "std": std, "least": min(values), "most": max(values)}
 
 
 def pooled(records_by_task: Mapping[str, Sequence[EpisodeRecord]], names: Sequence[str]) -> PooledFigures | None:

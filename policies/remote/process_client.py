@@ -47,7 +47,7 @@ class _Program(ServerLink[bytes, tuple[int, bytes]]):
         super().__init__(command.shown)
         self._words = command.words
         self._process: subprocess.Popen[bytes] | None = None
-        self._turn, self._number = threading.Lock(), 0
+        self._turn, self._number = threading.RLock(), 0
         self._out, self._in = bytearray(), bytearray()
 
     def start(self) -> subprocess.Popen[bytes]:
@@ -131,6 +131,7 @@ class _Program(ServerLink[bytes, tuple[int, bytes]]):
             end(self._process, PATIENCE)
             if self._turn.acquire(timeout=PATIENCE):  # whoever waits for an answer has met the end
                 self._process.stdout.close()
+                self._turn.release()
 
 
 class ProcessPolicy(RemotePolicy):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 from dataclasses import dataclass
@@ -36,19 +37,22 @@ class ProgramCommand:
             raise InputError(f"--policy process:{text}: {error}") from None
         if not words:
             raise InputError("--policy process: needs a command, as in 'process:python agent.py'")
-        files = [Path(word) for word in words if os.path.isfile(word)]
-        absolute = tuple(str(Path(word).absolute()) if Path(word) in files else word for word in words)
+        named = [os.path.isfile(word) for word in words]
+        named[0] = named[0] and os.sep in words[0]  # as in a shell, a name alone is one of the search path
+        absolute = tuple(str(Path(word).absolute()) if file else word for word, file in zip(words, named, strict=True))
         if shutil.which(absolute[0]) is None:
             raise InputError(f"--policy process:{text}: no program {words[0]} is found")
-        made = cls(absolute, tuple(file.absolute() for file in files))
+        made = cls(absolute, tuple(Path(word) for word, file in zip(absolute, named, strict=True) if file))
         if len(made.shown) > MAX_NAME // 2:
             raise InputError(f"--policy process:{made.shown[:40]}...: longer than {MAX_NAME // 2}; name a script")
         return made
 
     @property
     def decisive(self) -> tuple[Path, ...]:
-        """Files that count by content: those among the arguments; the program itself where there are none."""
-        return self.files[1:] if len(self.files) > 1 and str(self.files[0]) == self.words[0] else self.files
+        """Files that count by content: all of them, but for Python's interpreter before others."""
+        program = Path(self.words[0])
+        python = program in self.files[:1] and re.fullmatch(r"python[\d.]*", program.resolve().name)
+        return self.files[1:] if python and len(self.files) > 1 else self.files
 
     @property
     def text(self) -> str:

@@ -5,6 +5,7 @@ import importlib
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -18,7 +19,9 @@ from arena_newton.eval.adapters import gym
 from arena_newton.eval.certification.context import with_expert
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records.identity import foreign_task
 from arena_newton.eval.statistics import stats
+from arena_newton.tasks.judge import Condition, ConditionsJudge
 from arena_newton.usd_scenes.__main__ import main as scenes_main
 from arena_newton.usd_scenes.skeleton import write
 from arena_newton.usd_scenes.validate import task_of, validate
@@ -87,8 +90,70 @@ def test_its_scene_and_its_code_are_part_of_a_runs_identity(bell, monkeypatch):
         layer.write("# heavier\n")
     second = identity(bell)["foreign_tasks"]
     assert second[bell]["code"] == first[bell]["code"] and second[bell]["scene"] != first[bell]["scene"]
+    variants = tasks.get(bell).layer.parent / "variants"
+    variants.mkdir()
+    replaced = []
+    for text in ("#usda 1.0\n", "#usda 1.0\n# other\n"):
+        (variants / "semantic-2.usda").write_text(text, encoding="utf-8")
+        replaced.append(foreign_task(tasks.get(bell), ("base", "semantic-2")))
+    assert all(facts.items() > second[bell].items() for facts in replaced) and replaced[0] != replaced[1]
     monkeypatch.setattr("arena_newton.eval.records.identity.own_code", lambda part: "0123456789ab")
     assert identity(bell)["foreign_tasks"][bell]["code"] != first[bell]["code"]
+
+
+def test_layers_of_held_out_looks_are_part_of_a_runs_identity(bell):
+    """A layer that replaces the scene in a mode is hashed in runs of that mode alone."""
+
+    def facts(*modes):
+        options = RunOptions(task=(bell,), mode=modes, policy="stand", tracker=("pd",), engine="mujoco")
+        return resolve(options).identity()["foreign_tasks"][bell]
+
+    with pytest.raises(InputError, match="--mode semantic-2: task bell has no "):
+        facts("semantic-2")
+    layer = tasks.get(bell).layer.parent / "variants" / "semantic-2.usda"
+    layer.parent.mkdir(exist_ok=True)
+    shutil.copy(tasks.get(bell).layer, layer)
+    base, first = facts("base"), facts("base", "semantic-2")
+    assert first == base | {"layers": first["layers"]} and list(first["layers"]) == ["semantic-2"]
+    layer.write_text(layer.read_text(encoding="utf-8") + "# heavier\n", encoding="utf-8")
+    assert facts("semantic-2")["layers"] != first["layers"] and facts("base") == base
+
+
+def test_an_object_is_not_called_as_the_dynamics(bell):
+    """Samples of a task's objects and of an episode's dynamics share one record, so their names are kept apart."""
+    spec = tasks.get(bell)
+    taken = dataclasses.replace(tasks.get("football").objects[0], record="dynamics")
+    with pytest.raises(InputError, match="task 'bell': object 'dynamics': the name is taken"):
+        dataclasses.replace(spec, objects=(taken,))
+
+
+def test_a_name_hides_no_layer_of_other_runs(bell):
+    """A task of others that is called as a folder of the built-in scenes changes no identity of other runs."""
+    before = resolve(RunOptions(task=("football",))).identity()
+    tasks.register(dataclasses.replace(tasks.get(bell), name="textures"))
+    try:
+        assert resolve(RunOptions(task=("football",))).identity() == before
+    finally:
+        tasks.unregister("textures")
+
+
+def test_a_record_that_lends_a_judge_is_part_of_a_runs_identity(bell):
+    """A task of others whose judge and sampler are of this package is known by what its record says."""
+    spec = dataclasses.replace(tasks.get("football"), scene=tasks.get(bell).layer)
+    first, x = foreign_task(spec), spec.spawn_position[0] + 0.1
+    assert set(first) == {"record", "scene"} and foreign_task(spec) == first
+    moved = dataclasses.replace(spec, spawn_position=(x, *spec.spawn_position[1:]))
+    assert foreign_task(moved)["record"] != first["record"] and foreign_task(tasks.get("football")) == {}
+
+
+def test_success_that_nothing_decides_is_refused():
+    """A judge without a condition of success, or whose success asks for success, would judge by nothing."""
+    scene = SimpleNamespace(path="bell.usda")
+    for success in ([], [Condition("margin")]):
+        with pytest.raises(InputError, match=r"^bell\.usda: success needs conditions, and none of the kind margin"):
+            ConditionsJudge(scene, (), {}, success)
+    with pytest.raises(InputError, match=r"^bell\.usda: success for 0 ticks, expected at least 1"):
+        ConditionsJudge(scene, (), {}, [Condition("upright", 0.5)], 0)
 
 
 def test_names_that_are_taken_are_refused(bell):

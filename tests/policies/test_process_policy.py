@@ -15,6 +15,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.policies import Observation, PolicyUnavailable
 from arena_newton.policies.remote import process_client
+from arena_newton.policies.remote.program import ProgramCommand
 from tests.eval.eval_fakes import factories
 
 PROGRAM = """
@@ -168,6 +169,16 @@ def test_a_program_that_stays_is_ended(program, monkeypatch):
     assert policy._program.start().returncode == -9
 
 
+def test_an_endless_line_ends_the_program(program, monkeypatch):
+    """A line without an end is not kept: the program is ended at once, and the run stops."""
+    monkeypatch.setattr(process_client, "MAX_REPLY", 1 << 20)
+    monkeypatch.setattr(process_client, "PATIENCE", 0.05)
+    policy = program("sys.stdout.write('x' * (2 << 20)); sys.stdout.flush()")
+    with pytest.raises(PolicyUnavailable, match="the program is gone: .*the reply is longer than 1 MiB"):
+        policy.act(observation(2))
+    assert policy._program.start().stdout.closed
+
+
 @pytest.mark.parametrize(
     ("command", "says"),
     [
@@ -182,6 +193,23 @@ def test_a_command_that_is_none_is_refused(command, says):
     with pytest.raises(InputError) as caught:
         policies.get("process" if command is None else f"process:{command}")
     assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_files_of_a_command_count(tmp_path, monkeypatch):
+    """A program counts next to its arguments, Python's interpreter does not; a name alone is no file of this folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("agent", "python_agent", "weights.bin", "true"):
+        (tmp_path / name).write_text("#!/bin/sh\n")
+        (tmp_path / name).chmod(0o755)
+
+    def counted(command):
+        return [file.name for file in ProgramCommand.read(command).decisive]
+
+    assert counted("./agent weights.bin") == ["agent", "weights.bin"]
+    assert counted("./python_agent weights.bin") == ["python_agent", "weights.bin"]
+    assert counted(f"{sys.executable} agent weights.bin") == ["agent", "weights.bin"]
+    assert counted("./agent --fast") == ["agent"] and counted(f"{sys.executable} -m agents") == ["python"]
+    assert ProgramCommand.read("true agent").words == ("true", str(tmp_path / "agent"))
 
 
 def test_a_program_that_is_no_policy_is_refused(tmp_path):

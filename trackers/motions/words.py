@@ -81,7 +81,7 @@ class WordedMotion:
                 case [("close" | "open") as what, ("left" | "right") as side]:
                     self._command.hands[0, SIDES[side]] = float(what == "close")
                 case ["crouch", height]:
-                    self._command.height[0] = _number(height)
+                    self._command.height[0], self._command.pelvis_back[0] = _number(height), 0.0
                 case ["sit"]:
                     self._to(*self.pose)
                     self._command.height[0], self._command.pelvis_back[0] = SEAT

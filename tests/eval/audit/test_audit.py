@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from eval_fakes import FakeEnv, FakePolicy, factories
+from eval_fakes import FakeEnv, FakePolicy, factories, fake_tracker, last_tick
 from made_folders import stored
 
 from arena_newton import policies
@@ -99,6 +99,18 @@ def test_each_tracker_plays_its_own_episodes_again(honest, tmp_path, capsys):
     assert len(numbers) == 2
 
 
+def test_a_window_is_no_contradiction(honest, capsys):
+    """A replay shows a tracker with a lookahead another window than the run did: it is refused by name, not accused."""
+
+    def seeing(spec, checkpoint):
+        made = fake_tracker(spec, checkpoint)
+        made.lookahead = 2 if spec == "sonic" else 0
+        return made
+
+    assert main(["audit", str(honest / "run"), "--all"], factories(tracker=seeing)) == 2
+    assert "tracker sonic reads the coming reference, which recorded actions do not hold" in capsys.readouterr().err
+
+
 def test_older_journals_are_marked(tmp_path, capsys):
     """A folder of every older version is read and reported as unchained."""
     for schema in (1, 2):
@@ -170,6 +182,21 @@ def test_another_policys_actions_are_found(honest, capsys):
     said = capsys.readouterr().out
     assert said.count("at tick 0 the policy decides otherwise; actions differ by up to 0.5") == 6
     assert main([*asked, "--tolerance", "0.5"], factories(policy=Other)) == 0
+
+
+def test_a_metric_that_no_recorder_gave_is_found(tmp_path, capsys):
+    """A replay with the run's recorders holds lines with and without a metric to what they measure."""
+    run, made = tmp_path / "run", factories(recorders=last_tick)
+    assert main([*FLAGS[:5], "--seeds", "0", "--repeats", "4", "--out", str(run)], made) == 0
+    lines = journal_lines(run)
+    (index,) = [i for i, line in enumerate(lines) if line["outcome"] == "fall"][:1]
+    assert main(["audit", str(run), "--all"], made) == 0
+    lines[index]["extra"] = {"last_tick": 3.0}
+    write_lines(run, lines)
+    assert main(["report", str(run)]) == 0
+    capsys.readouterr()
+    assert main(["audit", str(run), "--all"], made) == 1
+    assert 'extra is {"last_tick": 3.0}, its actions give {}' in capsys.readouterr().out
 
 
 def rewritten(folder, lines, **arrays):

@@ -1,5 +1,6 @@
 """Recorders of another program in a run: their metrics in journal and tables, whoever plays, and what is refused."""
 
+import importlib
 import json
 import sys
 
@@ -84,7 +85,14 @@ def given(name, value):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"), [("a", float("nan"), "a is nan"), ("b", float("inf"), "b is inf"), ("", 1.0, " is 1.0")]
+    ("name", "value", "says"),
+    [
+        ("a", float("nan"), "a is nan"),
+        ("b", float("inf"), "b is inf"),
+        ("", 1.0, " is 1.0"),
+        ("c", None, "c is None"),
+        ("d", "quite fast", "d is quite fast"),
+    ],
 )
 def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
     """What JSON or a table cannot hold stops the run with a line that names the metric."""
@@ -94,13 +102,26 @@ def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
     assert "expected a finite number with a name" in said and journal(tmp_path / "a") == {}
 
 
-def test_a_run_goes_on_with_its_recorders_alone(measured, tmp_path, capsys):
+def test_a_metric_of_any_size_has_its_figures(tmp_path):
+    """A metric that a float just holds is in the tables, though its sum and its square are too large."""
+    big = sys.float_info.max
+    assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=given("big", big))) == 0
+    for cell in json.loads((tmp_path / "a" / "results.json").read_text())["cells"]:
+        assert cell["extra"]["big"] == {"episodes": 4, "mean": big, "std": 0.0, "least": big, "most": big}
+
+
+def test_a_run_goes_on_with_its_recorders_alone(measured, tmp_path, monkeypatch, capsys):
     """A run that another program would measure otherwise is refused, since half of its lines would lack the metric."""
     lines = (measured / "episodes.jsonl").read_text().splitlines(keepends=True)
     (tmp_path / "half").mkdir()
     (tmp_path / "half" / "config.json").write_bytes((measured / "config.json").read_bytes())
     (tmp_path / "half" / "episodes.jsonl").write_text("".join(lines[:5]))
     assert main(["resume", str(tmp_path / "half")], factories(recorders=given("other", 1.0))) == 2
+    assert "was run with recorders " in capsys.readouterr().err
+    (tmp_path / "study.py").write_text("import eval_fakes\n\n\ndef made(env):\n    return eval_fakes.last_tick(env)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    again = importlib.import_module("study").made
+    assert main(["resume", str(tmp_path / "half")], factories(recorders=again)) == 2
     assert "was run with recorders " in capsys.readouterr().err
     assert main(["resume", str(tmp_path / "half")], factories(recorders=last_tick)) == 0
 

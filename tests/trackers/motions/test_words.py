@@ -49,6 +49,9 @@ def test_a_seat_is_low_and_behind(motion):
     motion.reset()
     motion.say("sit")
     assert motion.actions(120)[-1][2] < 0.5 and motion.pose[0] < -0.1
+    motion.say("crouch 0.6")
+    motion.actions(120)
+    assert motion.generator.channel("pelvis_back").item() == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
