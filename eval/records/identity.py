@@ -72,7 +72,16 @@ UNHASHED = (
 (`__main__.py`). All other code counts, whatever is added to the package."""
 UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
-UNRULED = ("gym_id", "instruction", "spawn_position", "spawn_quat", "expert", "disturbance", "predicates", "target")
+UNRULED: tuple[str, ...] = (
+    "gym_id",
+    "instruction",
+    "spawn_position",
+    "spawn_quat",
+    "expert",
+    "disturbance",
+    "predicates",
+    "target",
+)
 UNRULED += ("interaction", "recolour", "events")
 """Fields of a `TaskSpec` that change an episode or what is kept of it, and are not among the hashed rules."""
 
