@@ -145,9 +145,13 @@ def check_spec(spec: str) -> None:
     """Validate a tracker's name without making the tracker.
 
     Raises:
-        InputError: Unknown name, or a name that is offered twice.
+        InputError: Unknown name, a name that is offered twice, or an argument that is empty or has a `+` or a space,
+            which divide names in tables.
     """
-    _TRACKERS.check(_split(spec)[0])
+    name, *argument = _split(spec)
+    _TRACKERS.check(name)
+    if argument and (not argument[0] or "+" in argument[0] or len(argument[0].split()) != 1):
+        raise InputError(f"--tracker {spec}: expected {name}:<argument>, without + and spaces")
 
 
 def get(spec: str, checkpoint: str | Path | None = None) -> Tracker:

@@ -77,7 +77,7 @@ class Physics(interfaces.Physics, ABC):
     @property
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model of the first world."""
-        return self._models[0]
+        return self._model_of[0]
 
     @abstractmethod
     def watch_pair(self, geoms_a: Sequence[int], geoms_b: Sequence[int], worlds: np.ndarray | None = None) -> None:

@@ -75,8 +75,14 @@ class Mode:
         for name, (low, high) in self.dynamics.items():
             if name not in QUANTITIES:
                 raise InputError(f"mode {self.name}: {name} is none of {', '.join(QUANTITIES)}")
-            whole, signed = QUANTITIES[name].whole, name == "push_heading"
-            if not low <= high or (low < 0.0 and not signed) or (whole and not float(high).is_integer()):
+            whole, signed, bounds = QUANTITIES[name].whole, name == "push_heading", (float(low), float(high))
+            if (
+                not (low <= high and all(map(math.isfinite, bounds)))
+                or (low < 0.0 and not signed)
+                or (low == 0.0 and name in ("robot_mass", "object_mass"))
+                or (high > 1.0 and name == "push_time")
+                or (whole and not all(bound.is_integer() for bound in bounds))
+            ):
                 raise InputError(f"mode {self.name}: {name}: {low:g} to {high:g} is not a range of it")
             if whole and high > MOST_LATENCY:
                 raise InputError(f"mode {self.name}: {name}: {high:g}, expected at most {MOST_LATENCY} ticks")

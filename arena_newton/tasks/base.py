@@ -370,6 +370,15 @@ class TaskSpec:
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)
     """Mode → what it changes in this task in particular, in words, where the rule sets differ."""
 
+    def __post_init__(self) -> None:
+        """Check the names of the objects.
+
+        Raises:
+            InputError: One has the name under which an episode's dynamics are recorded.
+        """
+        if any(one.record == modes.DYNAMICS for one in self.objects):
+            raise InputError(f"task {self.name!r}: object {modes.DYNAMICS!r}: the name is taken, records need another")
+
     @property
     def layer(self) -> Path:
         """The layer of its scene, which may not be built yet."""

@@ -98,8 +98,8 @@ def replay(
         tick_tolerance: Largest distance of a body after a tick of another engine [m].
 
     Raises:
-        InputError: They were played on another engine and no states were recorded, are demonstrations, or cannot be
-            played here.
+        InputError: They were played on another engine and no states were recorded, are demonstrations, were played
+            through a tracker with a lookahead, or cannot be played here.
     """
     run, made = audit.run, factories or Factories()
     stored, where = stored_options(run.folder), f"--replay: {run.folder}"
@@ -157,6 +157,12 @@ def _play(
     """Play these episodes of a folder's plan, and compare each."""
     run, wanted = audit.run, {_key(record): record for record in records}
     plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
+    for tracker in dict.fromkeys(record.tracker for record in records):
+        if getattr(made.tracker(tracker, plan.checkpoint), "lookahead", 0):
+            why = (
+                "reads the coming reference, which recorded actions do not hold: no replay can contradict its episodes"
+            )
+            raise InputError(f"--replay: {run.folder}: tracker {tracker} {why}")
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
     measured = made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))

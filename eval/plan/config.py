@@ -395,7 +395,9 @@ def resolve(options: RunOptions) -> RunConfig:
         scenes_hash=scenes_hash(tasks, task_specs.OWN, flags.mode),
         code_hash=code_hash(),
         mode_facts={name: facts for name in flags.mode if (facts := mode_facts(name, rule_set, tasks))},
-        foreign_tasks={name: facts for name in tasks if (facts := foreign_task(task_specs.get(name), flags.mode))},
+        foreign_tasks={
+            name: facts for name in tasks if (facts := foreign_task(task_specs.get(name), sorted(flags.mode)))
+        },
     )
 
 

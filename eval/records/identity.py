@@ -72,17 +72,9 @@ UNHASHED = (
 (`__main__.py`). All other code counts, whatever is added to the package."""
 UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
-UNRULED: tuple[str, ...] = (
-    "gym_id",
-    "instruction",
-    "spawn_position",
-    "spawn_quat",
-    "expert",
-    "disturbance",
-    "predicates",
-    "target",
-)
-UNRULED += ("interaction", "recolour", "events")
+UNRULED = (
+    "gym_id instruction spawn_position spawn_quat expert disturbance predicates target interaction recolour events"
+).split()
 """Fields of a `TaskSpec` that change an episode or what is kept of it, and are not among the hashed rules."""
 
 LARGE_BYTES = 8 << 20
@@ -242,8 +234,8 @@ def foreign_task(spec: TaskSpec, modes: Collection[str] = ()) -> JsonObject:
         facts["record"] = config_hash([repr(getattr(spec, name)) for name in UNRULED])
     if spec.scene is not None and not spec.scene.resolve().is_relative_to((PACKAGE / "usd_scenes").resolve()):
         facts["scene"] = layers_hash(spec.scene)
-        layers = {mode: layers_hash(own) for mode in modes if (own := spec.own_layer(mode)) is not None}
-        facts |= {"layers": config_hash(layers)} if layers else {}
+        layers = {mode: layers_hash(layer) for mode in modes if (layer := spec.own_layer(mode)) is not None}
+        facts |= {"layers": layers} if layers else {}
     return facts
 
 

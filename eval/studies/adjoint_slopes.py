@@ -23,7 +23,7 @@ from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.pages.tables import Table, csv_lines
 from arena_newton.tasks.handles import ROBOT
 
-__all__ = ["Slope", "play_slopes"]
+__all__ = ["Slope", "play_slopes", "worth"]
 
 FORMAT = 1
 """Version of slopes.json."""
@@ -31,6 +31,8 @@ CHECKPOINT = 25
 """Ticks that the graph keeps the start of."""
 STEP = 1e-2
 """Move of a placement that gives the slope of the start pose in it [m, rad]; what is moved are float32 numbers."""
+CHAOTIC = 100.0
+"""Change of the margin within the smaller scale above which a motion is chaotic [m]: no scene is so wide."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,12 @@ def play_slopes(
         )
     grid = [(a.margin - b.margin) / (2.0 * scales[1]) for a, b in zip(others[::2], others[1::2], strict=True)]
     env = cast("ArenaEnv", make_env(worlds.config, factories, worlds.config.episodes[0], 1))
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as `closed_loop` does, for the gradient
     try:
         found, answers = _slopes(_Moved(env, worlds, seed, at), played.steps, scales, grid)
     finally:
+        torch.set_num_threads(threads)
         env.close()
     head = ("number", "unit", "slope", *(f"differences at {scale:g}" for scale in scales), "policy acts again", "worth")
     cells = [
@@ -149,16 +153,19 @@ def _slopes(moved: _Moved, ticks: int, scales: Sequence[float], grid: Sequence[f
     names = [(axis.name, axis.unit) for axis in axes] + [(name, "") for name in parameters]
     acted = [*grid, *[None] * len(parameters)]
     return [
-        Slope(name, unit, one, near, far, again, _verdict(one, holds))
+        Slope(name, unit, one, near, far, again, worth(one, holds, scales[0]))
         for (name, unit), one, near, far, again, holds in zip(
             names, exact, found.near.tolist(), found.far.tolist(), acted, found.holds.tolist(), strict=True
         )
     ], rolled.answers
 
 
-def _verdict(slope: float | None, holds: bool) -> str:
+def worth(slope: float | None, holds: bool, scale: float) -> str:
+    """Worth of a slope in words: whether differences hold it, and whether its size within `scale` fits in a scene."""
     if slope is None:
         return "no slope: a fixture"
+    if not holds and abs(slope) * scale > CHAOTIC:
+        return "chaotic: the episode multiplies the smallest change"
     return "holds" if holds else "means nothing at these scales"
 
 
@@ -167,4 +174,8 @@ def _shifted(at: Sequence[float], number: int, change: float) -> list[float]:
 
 
 def _text(value: float | None) -> str:
-    return "-" if value is None else "fell" if not math.isfinite(value) else f"{value:+.4f}"
+    if value is None:
+        return "-"
+    if not math.isfinite(value):
+        return "fell"
+    return f"{value:+.4f}" if abs(value) < 1e6 else f"{value:+.2e}"

@@ -9,6 +9,7 @@ import torch
 
 from arena_newton import rule_sets, tasks, trackers
 from arena_newton.cli import registry
+from arena_newton.differentiable.engine_step import EngineStep
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan.config import resolve
@@ -61,11 +62,15 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
         ({"dynamics": {"gains": (-0.1, 0.3)}}, "mode wet: gains: -0.1 to 0.3 is not a range of it"),
         ({"dynamics": {"friction": (NAN, 1.0)}}, "mode wet: friction: nan to 1 is not a range of it"),
         ({"dynamics": {"action_latency": (0, 1.5)}}, "mode wet: action_latency: 0 to 1.5 is not a range of it"),
+        ({"dynamics": {"action_latency": (0.5, 2)}}, "mode wet: action_latency: 0.5 to 2 is not a range of it"),
+        ({"dynamics": {"friction": (0.5, float("inf"))}}, "mode wet: friction: 0.5 to inf is not a range of it"),
+        ({"dynamics": {"object_mass": (0.0, 1.0)}}, "mode wet: object_mass: 0 to 1 is not a range of it"),
+        ({"dynamics": {"push_time": (0.5, 1.5)}}, "mode wet: push_time: 0.5 to 1.5 is not a range of it"),
         ({"dynamics": {"state_latency": (0, 11)}}, "mode wet: state_latency: 11, expected at most 10 ticks"),
     ],
 )
 def test_ranges_that_are_none_are_refused(change, message):
-    """An unknown quantity, reversed bounds, a fraction of a tick: one line that names mode and quantity."""
+    """An unknown quantity, reversed or endless bounds, no mass, part of a tick, a time after the end: one line."""
     with pytest.raises(InputError, match=message):
         dataclasses.replace(WET, **change)
 
@@ -153,6 +158,27 @@ def test_worlds_of_one_batch_have_dynamics_of_their_own(engine, ticks):
         assert np.array_equal(mixed[:, world], base[:, world]) == same
         assert np.array_equal(again[:, world], base[:, world]) == (world > 0)
     assert np.array_equal(again[:, 0], mixed[:, 2])
+
+
+def test_a_differentiable_tick_has_the_dynamics_of_its_episode():
+    """The model of a single world is the one that its episode drew, and gradients are of it; then the built one."""
+    env = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", threads=1)
+    env.reset([5])
+    physics, built, before = env.physics, env.physics.mj_model, env.physics.snapshot()
+
+    def moved(sample):
+        physics.set_dynamics(np.array([0]), [sample])
+        physics.restore(before)
+        physics.ctrl.fill_(0.3)
+        step = EngineStep(physics)
+        after = step(step.state(), torch.full((1, built.nu), 0.3)).qpos
+        physics.step()
+        return after.numpy(), physics.qpos.numpy().copy()
+
+    predicted, heavy = moved({"robot_mass": 1.2, "gains": 0.8})
+    assert physics.mj_model is physics.models[0] is not built and np.allclose(predicted, heavy, rtol=0, atol=1e-6)
+    assert np.abs(moved({})[1] - heavy).max() > 1e-4 and physics.mj_model is built
+    env.close()
 
 
 def test_engine_warp_scales_the_fields_of_a_world():

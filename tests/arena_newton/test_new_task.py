@@ -101,6 +101,32 @@ def test_its_scene_and_its_code_are_part_of_a_runs_identity(bell, monkeypatch):
     assert identity(bell)["foreign_tasks"][bell]["code"] != first[bell]["code"]
 
 
+def test_layers_of_held_out_looks_are_part_of_a_runs_identity(bell):
+    """A layer that replaces the scene in a mode is hashed in runs of that mode alone."""
+
+    def facts(*modes):
+        options = RunOptions(task=(bell,), mode=modes, policy="stand", tracker=("pd",), engine="mujoco")
+        return resolve(options).identity()["foreign_tasks"][bell]
+
+    with pytest.raises(InputError, match="--mode semantic-2: task bell has no "):
+        facts("semantic-2")
+    layer = tasks.get(bell).layer.parent / "variants" / "semantic-2.usda"
+    layer.parent.mkdir(exist_ok=True)
+    shutil.copy(tasks.get(bell).layer, layer)
+    base, first = facts("base"), facts("base", "semantic-2")
+    assert first == base | {"layers": first["layers"]} and list(first["layers"]) == ["semantic-2"]
+    layer.write_text(layer.read_text(encoding="utf-8") + "# heavier\n", encoding="utf-8")
+    assert facts("semantic-2")["layers"] != first["layers"] and facts("base") == base
+
+
+def test_an_object_is_not_called_as_the_dynamics(bell):
+    """Samples of a task's objects and of an episode's dynamics share one record, so their names are kept apart."""
+    spec = tasks.get(bell)
+    taken = dataclasses.replace(tasks.get("football").objects[0], record="dynamics")
+    with pytest.raises(InputError, match="task 'bell': object 'dynamics': the name is taken"):
+        dataclasses.replace(spec, objects=(taken,))
+
+
 def test_a_name_hides_no_layer_of_other_runs(bell):
     """A task of others that is called as a folder of the built-in scenes changes no identity of other runs."""
     before = resolve(RunOptions(task=("football",))).identity()

@@ -31,6 +31,12 @@ def test_unknown_name():
     assert "--tracker sonick" in message("sonick") and "pd" in message("sonick")
 
 
+@pytest.mark.parametrize("spec", ["sonic:", "sonic:v1+1", "sonic:v1 1"])
+def test_arguments_that_tables_cannot_name_are_refused(spec):
+    """No argument behind the colon, a plus sign and a space are refused: tables join names of trackers by them."""
+    assert message(spec) == f"--tracker {spec}: expected sonic:<argument>, without + and spaces"
+
+
 @pytest.mark.parametrize("name", ["twist2", "sonic"])
 def test_needs_weights(name, monkeypatch, tmp_path):
     """A tracker whose weights are not installed says what to do."""

@@ -70,7 +70,7 @@ def test_committed_layer_is_what_the_author_writes(tmp_path):
     """The committed scene is the author's output, byte for byte."""
     from arena_newton.physics.scene import scene_path
 
-    (written,) = build_all(tmp_path, ["lab"])
+    *_, written = build_all(tmp_path, ["textures", "g1", "lab"])
     assert (written / "scene.usda").read_text() == scene_path("lab").read_text()
 
 

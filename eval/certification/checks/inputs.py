@@ -21,7 +21,7 @@ from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import check_parts
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted
-from arena_newton.interfaces import Chunk, Observation, Tracker
+from arena_newton.interfaces import Chunk, Observation, RobotState, Tracker, TrackerCommand
 from arena_newton.pages.tables import Table
 from arena_newton.policies.base import Mask, Policy
 from arena_newton.robot.canonical import STAND_ACTION
@@ -121,16 +121,17 @@ def _copied(part: object) -> object:
     """A copy of a mask, or of the tensors of a command or state."""
     if isinstance(part, torch.Tensor):
         return part.clone()
-    return None if part is None else type(part)(**{key: value.clone() for key, value in vars(part).items()})
+    return part.mapped(torch.clone) if isinstance(part, RobotState | TrackerCommand) else None
 
 
 def _renewed(kept: dict[str, object], part: object) -> object:
     """The copy as the same object at each call, as a tracker in a world is given its command and state."""
-    if part is None or isinstance(part, torch.Tensor):
+    if not isinstance(part, RobotState | TrackerCommand):
         return part
-    same = kept.setdefault(type(part).__name__, part)
-    for key, value in vars(part).items():
-        getattr(same, key).copy_(value.clone())
+    same = kept.setdefault(type(part).__name__, part.mapped(torch.clone))
+    assert isinstance(same, RobotState | TrackerCommand)
+    for value, new in zip(same.tensors().values(), part.tensors().values(), strict=True):
+        value.copy_(new)
     return same
 
 

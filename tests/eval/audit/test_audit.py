@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from eval_fakes import FakeEnv, FakePolicy, factories, last_tick
+from eval_fakes import FakeEnv, FakePolicy, factories, fake_tracker, last_tick
 from made_folders import stored
 
 from arena_newton import policies
@@ -97,6 +97,18 @@ def test_each_tracker_plays_its_own_episodes_again(honest, tmp_path, capsys):
         assert "replayed 0 of 40" in said
         numbers.add(int(said.removeprefix("--draw ").partition(":")[0]))
     assert len(numbers) == 2
+
+
+def test_a_window_is_no_contradiction(honest, capsys):
+    """A replay shows a tracker with a lookahead another window than the run did: it is refused by name, not accused."""
+
+    def seeing(spec, checkpoint):
+        made = fake_tracker(spec, checkpoint)
+        made.lookahead = 2 if spec == "sonic" else 0
+        return made
+
+    assert main(["audit", str(honest / "run"), "--all"], factories(tracker=seeing)) == 2
+    assert "tracker sonic reads the coming reference, which recorded actions do not hold" in capsys.readouterr().err
 
 
 def test_older_journals_are_marked(tmp_path, capsys):

@@ -350,13 +350,6 @@ def test_task_without_an_expert_is_refused_first(tmp_path, capsys, without_an_ex
     assert not out.exists()
 
 
-def test_default_run_leaves_out_a_task_without_an_expert(without_an_expert):
-    """Without flags the tasks that have an expert run; another policy gets all of them, as `--task all` does."""
-    assert resolve(RunOptions(engine="mujoco")).flags.task == tuple(TASKS[1:])
-    assert resolve(RunOptions(engine="mujoco", policy="stand")).flags.task == tuple(TASKS)
-    assert resolve(RunOptions(engine="mujoco", task=("all",))).flags.task == tuple(TASKS)
-
-
 @pytest.mark.parametrize(
     "words",
     ["run --task boxing --out", "run --policy learned:", "report", "merge . --out", "merge", "pack", "pack . --out"]

@@ -5,11 +5,13 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from eval_fakes import PlacedEnv, factories
 
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.studies.adjoint_slopes import worth
 from arena_newton.eval.studies.placement_axes import axes_of, chosen, moved
 from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
@@ -177,10 +179,14 @@ def test_samples_place_what_the_seed_would(tmp_path):
     env.close()
 
 
-def test_slopes_of_an_episode(tmp_path, capsys):
-    """`--method adjoint` writes the exact slope to each placement and factor beside differences."""
+def test_slopes_of_an_episode(tmp_path, capsys, request):
+    """`--method adjoint` writes exact slopes beside differences; torch has as many threads afterwards as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    request.addfinalizer(lambda: torch.set_num_threads(before))
     flags = "--task football --policy stand --rules released --engine mujoco --fast-physics --max-steps 2"
     assert main(["sensitivity", "--method", "adjoint", *flags.split(), "--out", str(tmp_path / "out")]) == 0
+    assert torch.get_num_threads() == 3
     found = {one["number"]: one for one in rows(tmp_path / "out" / "slopes.csv")}
     assert list(found)[:2] == ["football.x", "football.y"] and "mass:/World/Ball" in found
     ahead = found["football.y"]
@@ -190,6 +196,15 @@ def test_slopes_of_an_episode(tmp_path, capsys):
     told = json.loads((tmp_path / "out" / "slopes.json").read_text())
     assert (told["outcome"], told["ticks"], told["policy_has_gradient"]) == ("timeout", 2, False)
     assert "actions are constants" in capsys.readouterr().out
+
+
+def test_worth_of_a_slope_in_words():
+    """A slope that would lead out of every scene within the smaller scale is called chaotic, by its size alone."""
+    assert worth(None, False, 0.001) == "no slope: a fixture"
+    assert worth(-17.0, True, 0.001) == "holds"
+    assert worth(-17.0, False, 0.001) == "means nothing at these scales"
+    assert worth(-5.99e12, False, 0.001).startswith("chaotic: ")
+    assert worth(5.99e12, False, 1e-15) == "means nothing at these scales"
 
 
 def test_unfit_flags_of_slopes(capsys):

@@ -59,7 +59,7 @@ def make_runner(env, log_dir=None, **changes) -> TrackerRunner:
         data={"clips": 2, "families": {"stand": {"clips": 1, "minutes": 0.1}}, "sources": ["test"]},
         licences={"Apache-2.0": 2},
         action_form=dataclasses.asdict(env.front_end.action_form),
-        drive=dataclasses.asdict(TWIST2_DRIVE),
+        drive=TWIST2_DRIVE.as_json(),
         physics=dataclasses.asdict(PhysicsRate(0.005, 4)),
     )
     return TrackerRunner(env, options, {"hidden": [64, 64]}, card, log_dir)
