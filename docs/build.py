@@ -30,7 +30,7 @@ READING = {
         docs/authoring docs/add_a_task docs/research docs/experts docs/recording docs/datasets docs/curation
         docs/training docs/training_policies docs/recipes docs/loop docs/suites docs/machines docs/comparing
         docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients
-        docs/api examples/index""",
+        docs/gradient_examples docs/api examples/index""",
     "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
         CHANGELOG""",
     "Results": """docs/results/README docs/results/findings docs/results/reproductions docs/results/trainings
