@@ -10,7 +10,7 @@ import os
 import pickle
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from multiprocessing.reduction import ForkingPickler
 from typing import TYPE_CHECKING
@@ -163,8 +163,8 @@ class WorkerPool:
             factories: What they build runs with; the real parts by default.
         """
         self.backend, self._most, self._factories = backend, most, factories
-        if isinstance(backend, LocalBackend):
-            _check_importable(factories, backend.flag)
+        # Ray carries parts of the program itself, but recorders are known by the file that holds their code.
+        _check_importable(factories, backend.flag, None if isinstance(backend, LocalBackend) else ("recorders",))
         self.workers: list[Worker] = []
         self.shown: Progress | None = None
         """Progress that shows losses."""
@@ -360,13 +360,15 @@ class WorkerPool:
         return time.monotonic() + 60.0 * self.backend.minutes
 
 
-def _check_importable(factories: Factories | None, flag: str) -> None:
-    """Refuse parts of a run that another process of this machine cannot import.
+def _check_importable(factories: Factories | None, flag: str, names: Collection[str] | None) -> None:
+    """Refuse parts of a run, those named or all, that another process cannot import.
 
     Raises:
         InputError: One is of the program that was started, or of no module.
     """
     for name, part in vars(factories).items() if factories is not None else ():
+        if names is not None and name not in names:
+            continue
         made = part.func if isinstance(part, functools.partial) else part
         try:
             ForkingPickler.dumps(part)

@@ -3,13 +3,16 @@
 import importlib
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
-from eval_fakes import factories, last_tick
+from eval_fakes import FakeEnv, factories, last_tick
 
+from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.workers.shard_merge import merge
+from arena_newton.eval.workers.worker_pool import WorkerPool
 from arena_newton.interfaces import Recorder
 
 RUN = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
@@ -139,3 +142,14 @@ def test_parts_that_no_other_process_can_import_are_refused(tmp_path, monkeypatc
     assert "error: --jobs 2: Factories.recorders is <function " in said
     assert "other processes import it by module and name" in said
     assert "Traceback" not in said
+
+
+def test_ray_carries_no_recorders_of_the_program(monkeypatch):
+    """Recorders are known by the file of their code, which on a node is another; other parts may travel."""
+    backend = SimpleNamespace(flag="--ray", room=lambda: 0)
+    monkeypatch.setattr(sys.modules["__main__"], "last_tick", last_tick, raising=False)
+    monkeypatch.setattr(last_tick, "__module__", "__main__")
+    with pytest.raises(InputError, match=r"^--ray: Factories\.recorders is <function last_tick"):
+        WorkerPool(backend, 0, factories(recorders=last_tick))
+    monkeypatch.setattr(FakeEnv, "__module__", "__main__")
+    WorkerPool(backend, 0, factories(env=FakeEnv))
