@@ -123,9 +123,9 @@ def test_a_landing_does_not_move_with_the_vertical_speed():
     found = slopes(velocity.detach(), 50, 0.02)[:, 1]
     assert float(grad[1]) == pytest.approx(float(found[1]), rel=1e-3)
     assert abs(float(grad[2]) - float(found[2])) > 0.1
-    page = (Path(__file__).parents[2] / "docs" / "gradients.md").read_text().replace("−", "-")
+    page = (Path(__file__).parents[2] / "docs" / "gradient_examples.md").read_text().replace("−", "-")
     told = re.search(r"\((\S+) against (\S+) by differences, 1 s .*?\((\S+) against (\S+)\)", page, re.DOTALL)
-    assert told, "docs/gradients.md no longer says what a bounce does"
+    assert told, "docs/gradient_examples.md no longer says what a bounce does"
     measured = (grad[1], found[1], grad[2], found[2])
     assert [float(number) for number in told.groups()] == [pytest.approx(float(one), abs=0.006) for one in measured]
 
