@@ -22,7 +22,7 @@ def action(tick: int) -> list[float]:
     return [0.0, 0.0, height, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, *STAND, 0.0, 0.0]
 
 
-def answer(asked: dict) -> dict:  # type: ignore[type-arg]
+def answer(asked: dict) -> dict:
     """What is said to a request: who this is, that an episode may begin, or ten actions."""
     if asked["request"] == "config":
         return {"arena": 1, "needs_picture": False}

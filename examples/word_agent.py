@@ -62,7 +62,7 @@ class Agent:
         corner = next((point for point in path if math.dist(point, here) > 0.3), path[-1])
         return f"walk to {corner[0]:.2f} {corner[1]:.2f}"
 
-    def act(self, asked: dict) -> list[list[float]]:  # type: ignore[type-arg]
+    def act(self, asked: dict) -> list[list[float]]:
         """Half a second of motion; a new sentence once the robot has stood for a second."""
         self.waited = self.waited + 1 if self.motion.arrived else 0
         if self.waited > 2:
