@@ -23,7 +23,7 @@ def action(tick: int) -> list[float]:
 
 
 def answer(asked: dict) -> dict:
-    """What is said to a request: who this is, that an episode may begin, or ten actions."""
+    """Answer a request: the policy's name, that an episode may begin, or ten actions."""
     if asked["request"] == "config":
         return {"arena": 1, "needs_picture": False}
     if asked["request"] == "reset":

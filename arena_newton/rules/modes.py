@@ -162,9 +162,11 @@ def get(name: str) -> Mode:
     Raises:
         InputError: Unknown name, or a package that offers something else.
     """
+    if name in BUILT_IN:
+        return BUILT_IN[name]
     if name not in names():
         raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
-    mode = BUILT_IN.get(name) or _MODES.make(name)
+    mode = _MODES.make(name)
     if mode.name != name:
         raise InputError(f"--mode {name}: its package calls it {mode.name}; entry point and record need one name")
     return mode

@@ -255,7 +255,7 @@ def test_the_expert_of_a_package_solves_its_task_and_resume_knows_the_package(pu
 
 
 def missing_rows(spec, own=True):
-    """What a task lacks, each with the file to edit."""
+    """Rows that a task lacks, each with the file to edit."""
     name, rows = spec.name, {}
     record = f"arena_newton/tasks/{name}.py"
     rows[f"{record}: requires"] = spec.requires

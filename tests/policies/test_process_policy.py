@@ -189,7 +189,7 @@ def test_an_endless_line_ends_the_program(program, monkeypatch):
     ],
 )
 def test_a_command_that_is_none_is_refused(command, says):
-    """What cannot be started is one line before the first episode."""
+    """A program that cannot be started is one line before the first episode."""
     with pytest.raises(InputError) as caught:
         policies.get("process" if command is None else f"process:{command}")
     assert says in str(caught.value) and "\n" not in str(caught.value)

@@ -98,7 +98,7 @@ def given(name, value):
     ],
 )
 def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
-    """What JSON or a table cannot hold stops the run with a line that names the metric."""
+    """A metric that JSON or a table cannot hold stops the run with a line that names it."""
     assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=given(name, value))) == 2
     said = capsys.readouterr().err
     assert f"error: recorder: metric {says}".replace("  ", " ") in said.replace("  ", " ")

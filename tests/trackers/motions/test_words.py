@@ -38,7 +38,7 @@ def test_walking_and_turning_end_where_they_were_sent(motion):
 
 
 def test_the_reference_turns_to_a_measured_heading(motion):
-    """What is measured of the robot's heading is where the next walk begins."""
+    """The robot's measured heading is where the next walk begins."""
     motion.reset()
     motion.actions(1, measured=0.5)
     assert motion.pose[2] == pytest.approx(0.5, abs=0.01)
