@@ -47,7 +47,7 @@ MAX_ENTRIES = 1000
 policies, three seeds."""
 CONDITIONS = (
     *("seeds", "repeats", "max_steps", "worlds", "engine", "device", "drive", "fast_physics", "skip_broken"),
-    *("video", "strip", "video_episodes", "video_size", "follow", "actions"),
+    *("video", "strip", "video_episodes", "video_size", "follow", "actions", "failures"),
     *("remote_timeout", "remote_retries", "remote_sequential", "remote_insecure"),
 )
 """Flags of `eval run` that a suite may set for all its cells, in [defaults]."""
