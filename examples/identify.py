@@ -9,6 +9,7 @@ the cross-entropy method (CEM) on the same windows for three times as long. Minu
 import argparse
 import math
 import time
+from typing import cast
 
 import mujoco
 import torch
@@ -45,9 +46,10 @@ class Late:
 
 
 def recorded(truth: torch.Tensor, ticks: int, noise: torch.Tensor) -> differentiable.Recorded:
-    """A walk of the other robot from its second second on, as its sensors see it."""
+    """A walk of the other robot from its third second on, as its sensors see it."""
     late, states = Late(trackers.get("twist2"), float(truth[-1])), list[differentiable.EngineState]()
-    env = ArenaEnv("football", tracker=late, worlds=1, engine="mujoco", rules="released", fast_physics=True)
+    tracker = cast(trackers.Tracker, late)  # by `__getattr__`
+    env = ArenaEnv("football", tracker=tracker, worlds=1, engine="mujoco", rules="released", fast_physics=True)
     model, action = env.physics.mj_model, torch.from_numpy(canonical.STAND_ACTION).repeat(1, 1)
     for name, factor in zip(NAMES.values(), truth.exp().tolist(), strict=False):
         for field, index in scaled(name, env.scene):
@@ -55,11 +57,11 @@ def recorded(truth: torch.Tensor, ticks: int, noise: torch.Tensor) -> differenti
     mujoco.mj_setConst(model, mujoco.MjData(model))
     env.reset([5])
     read = differentiable.EngineStep(env.physics)
-    for tick in range(-env.startup_ticks, ticks + 50):
+    for tick in range(-env.startup_ticks, ticks + 100):
         if tick == 0:
             env.observe()  # at step 0 the reference starts where the robot is
         if tick >= 0:
-            action[:, :2] = torch.tensor([0.008 + 0.004 * math.sin(tick / 20.0), 0.002 * math.sin(tick / 15.0)])
+            action[:, :2] = torch.tensor([0.01 + 0.005 * math.sin(tick / 8.0), 0.003 * math.sin(tick / 11.0)])
         states.append(read.state())
         env.step(action)
     qpos, qvel = (torch.cat(column[-ticks:]) for column in list(zip(*states, read.state(), strict=True))[:2])

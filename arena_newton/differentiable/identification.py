@@ -50,6 +50,9 @@ class Fit(NamedTuple):
     """Fisher's information of the numbers before this step, without their spread: the roots of the diagonal of its
     inverse are the standard errors to expect, shape [parameters + 1, parameters + 1]."""
 
+    moves: torch.Tensor
+    """Tangent moves of the windows' starts from what was measured, shape [windows, 2 nv]."""
+
 
 class Windows:
     """Short windows of a recording, one per world of a physics."""
@@ -94,16 +97,39 @@ class Windows:
     def fit(
         self, numbers: torch.Tensor, spread: torch.Tensor, *, iterations: int = 20, starts: bool = True
     ) -> Iterator[Fit]:
-        """Fit until a step gains less than a thousandth.
+        """Fit until a step gains less than a hundredth.
+
+        Starts that settled while the numbers were wrong may keep a contact that was none; where more than noise is
+        left, they begin again as measured.
 
         Args:
             numbers: Where to begin: logarithms of the factors, then the latency [ticks].
             spread: Standard deviations with which the true ones are expected about them, of the same shape.
-            iterations: Most steps.
+            iterations: Most steps until then, and again afterwards.
             starts: Fit the windows' starts too, instead of taking them as measured.
         """
+        best = None
+        for best in self._descend(numbers, spread, iterations, starts):
+            yield best
+        if best is None or best.misfit < 1.1 or not starts:
+            return
+        moves = None
+        for settled in self._descend(best.numbers, 1e-3 * spread, 4, starts):
+            moves = settled.moves
+        for later in self._descend(best.numbers, spread, iterations, starts, moves):
+            if later.misfit < best.misfit:
+                yield (best := later)
+
+    def _descend(
+        self,
+        numbers: torch.Tensor,
+        spread: torch.Tensor,
+        iterations: int,
+        starts: bool,
+        moves: torch.Tensor | None = None,
+    ) -> Iterator[Fit]:
         guess, damping = numbers, 1.0
-        moves = numbers.new_zeros(len(self._begin), 2 * self._model.nv)
+        moves = numbers.new_zeros(len(self._begin), 2 * self._model.nv) if moves is None else moves
         for _ in range(iterations):
             residual, by_start, by_number = self._played(numbers, moves, slopes=True)
             by_start = by_start if starts else by_start[..., :0]
@@ -139,8 +165,8 @@ class Windows:
                 return
             numbers, moves, damping = tried, moved, max(damping / 4.0, 1e-4)
             free = after.numel() - len(numbers) - by_start.shape[0] * by_start.shape[2]
-            yield Fit(numbers, float(_loss(after).sum()) / free, information)
-            if gained < 1e-3 * loss:
+            yield Fit(numbers, float(_loss(after).sum()) / free, information, moves)
+            if gained < 1e-2 * loss:
                 return
 
     def _played(
