@@ -27,7 +27,11 @@ PAPER = ("football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing",
 OWN = PAPER
 """All tasks of this package; one that is not the paper's follows here."""
 _TASKS: Registry[TaskSpec] = Registry(
-    "task", "arena_newton.tasks", lambda: TaskSpec, {name: f"arena_newton.tasks.{name}:TASK" for name in OWN}, named=True
+    "task",
+    "arena_newton.tasks",
+    lambda: TaskSpec,
+    {name: f"arena_newton.tasks.{name}:TASK" for name in OWN},
+    named=True,
 )
 
 

@@ -1,7 +1,7 @@
 """A metric as a package: the highest speed of each episode, in the journal and the tables of any run.
 
-    uv pip install -e examples/new_metric
-    python -m arena_newton.eval --task boxing --recorder speed --seeds 0 --repeats 4
+uv pip install -e examples/new_metric
+python -m arena_newton.eval --task boxing --recorder speed --seeds 0 --repeats 4
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
-"""A policy with three cameras as a package: it turns to what is yellow, and closes a hand whose wrist sees something near.
+"""A policy with three cameras as a package: it turns to what is yellow, and closes a hand on what its wrist sees near.
 
-Shows: `cameras`, pictures and depths of several cameras, an entry point. More: docs/policies.md.
+Shows: `cameras`, pictures and depths of several cameras, an entry point. More: docs/howto/bring/policies.md.
 
     uv pip install -e examples/new_policy
     python -m arena_newton doctor --policy wary
