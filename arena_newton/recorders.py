@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from arena_newton.cli.registry import Registry
 from arena_newton.interfaces import EpisodeResult, Recorder, World
@@ -36,7 +36,7 @@ class Metric(Recorder):
     name: str
     """Name in journal and tables."""
     fold: Literal["highest", "lowest", "mean", "total", "last"] = "highest"
-    """What the metric is of the values since step 0; one that is NaN does not count."""
+    """Way in which the values since step 0 make the metric; one that is NaN does not count."""
 
     def __init__(self, env: World):
         """Begin without values."""
@@ -46,7 +46,7 @@ class Metric(Recorder):
         """Values after a tick, shape [worlds]."""
         raise TypeError(f"metric {self.name!r} defines no measure()")
 
-    def start(self, env: World, world: int, episode: Any) -> None:
+    def start(self, env: World, world: int, episode: object) -> None:
         """See `Recorder.start`."""
         self._values[world] = []
 

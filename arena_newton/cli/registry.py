@@ -85,17 +85,10 @@ class Registry[T]:
             InputError: Unknown or doubled name, a package that does not load, a maker that does not fit, or another
                 name than that of what it makes, where they are `named`.
         """
-        made = self._made(name, *arguments, **options)
-        own = getattr(made, "name", name) if self.named else name
-        if own != name:
-            raise InputError(f"--{self.noun} {name}: its package calls it {own}; entry point and record need one name")
-        return made
-
-    def _made(self, name: str, *arguments: Any, **options: Any) -> T:
         self.check(name)
         factory = self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
         if isinstance(factory, self.base()):
-            return factory
+            return self._known_as(name, factory)
         if not callable(factory):
             raise InputError(f"--{self.noun} {name}: its package offers a {type(factory).__name__}, not a {self.noun}")
         try:
@@ -108,6 +101,12 @@ class Registry[T]:
         if not isinstance(made, self.base()):
             kind = self.base().__name__
             raise InputError(f"--{self.noun} {name}: its factory makes a {type(made).__name__}, not a {kind}")
+        return self._known_as(name, made)
+
+    def _known_as(self, name: str, made: T) -> T:
+        own = getattr(made, "name", name) if self.named else name
+        if own != name:
+            raise InputError(f"--{self.noun} {name}: its package calls it {own}; entry point and record need one name")
         return made
 
     def _own(self, name: str) -> Callable[..., T] | T:
