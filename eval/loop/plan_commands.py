@@ -156,9 +156,10 @@ def plan_commands(
             after=tuple(f"evaluate {row.name}" for row in rows),
         )
     )
-    if rows[0].train.policy == "act":  # others are not packed
-        card = partial(_packed, plan, folders, rows[0], middle)
-        found.append(PlanCommand(stage="card", name=rows[0].name, words=card, after=("tables",)))
+    first = plan.rows[0]
+    if first in rows and first.train.policy == "act":  # other families are not packed
+        card = partial(_packed, plan, folders, first, middle)
+        found.append(PlanCommand(stage="card", name=first.name, words=card, after=("tables",)))
     return found
 
 
