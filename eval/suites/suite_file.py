@@ -1,6 +1,7 @@
 """The suite file: a TOML table of policies, trackers, tasks, modes and rules, read and checked.
 
-docs/suites.md describes its tables. Nothing is expanded here and no checkpoint is looked for: see `matrix_cells`.
+docs/howto/evaluate/suites.md describes its tables. Nothing is expanded here and no checkpoint is looked for: see
+`matrix_cells`.
 """
 
 from __future__ import annotations
