@@ -17,7 +17,7 @@ from pathlib import Path
 from arena_newton import tasks
 from arena_newton.cli.flags import words
 from arena_newton.data.datasets.data_options import BuildOptions
-from arena_newton.eval.loop.plan_file import Plan, PlanRow, policy_name, suite_text
+from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow, policy_name, suite_text
 from arena_newton.eval.loop.stage_state import played, succeeded, trained
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import write_atomic
@@ -93,7 +93,7 @@ class PlanCommand:
 
 
 def plan_commands(
-    plan: Plan,
+    plan: LoopPlan,
     folders: PlanFolders,
     *,
     rows: Sequence[PlanRow],
@@ -163,7 +163,9 @@ def plan_commands(
     return found
 
 
-def _demonstrations(plan: Plan, folders: PlanFolders, task: str, tracker: str, device: str | None) -> list[PlanCommand]:
+def _demonstrations(
+    plan: LoopPlan, folders: PlanFolders, task: str, tracker: str, device: str | None
+) -> list[PlanCommand]:
     """Recordings of a pair, and the dataset that is built of them."""
     parts, dataset = plan.parts.get(task, 1), folders.dataset(task, tracker)
     sets = folders.recordings(task, tracker, parts)
@@ -190,7 +192,7 @@ def _demonstrations(plan: Plan, folders: PlanFolders, task: str, tracker: str, d
     return [*recorded, built]
 
 
-def _recording(plan: Plan, task: str, tracker: str, part: str, folder: Path, device: str | None) -> list[str]:
+def _recording(plan: LoopPlan, task: str, tracker: str, part: str, folder: Path, device: str | None) -> list[str]:
     """Flags of a recording."""
     attempts, parts = plan.attempts[task], int(part.partition("/")[2])
     options = dataclasses.replace(
@@ -230,7 +232,7 @@ def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: in
 
 
 def _evaluated(
-    plan: Plan, folders: PlanFolders, row: PlanRow, seeds: Sequence[int], device: str | None, gpus: int
+    plan: LoopPlan, folders: PlanFolders, row: PlanRow, seeds: Sequence[int], device: str | None, gpus: int
 ) -> list[str]:
     """Play the trainings of a row: those of this call, and others that are there."""
     seeds = sorted({*seeds, *folders.trained(row)})
@@ -242,7 +244,7 @@ def _evaluated(
     return [EVAL, "matrix", str(file), "--out", str(suite), *jobs, *(["--device", device] if device else [])]
 
 
-def _packed(plan: Plan, folders: PlanFolders, row: PlanRow, middle: Callable[[PlanRow], int]) -> list[str]:
+def _packed(plan: LoopPlan, folders: PlanFolders, row: PlanRow, middle: Callable[[PlanRow], int]) -> list[str]:
     """Pack a training; cells whose budgets were cut are no results, and are not in its card."""
     suite = str(folders.suite(row))
     results = [] if plan.evaluate.get("max_steps") else ["--results", suite]

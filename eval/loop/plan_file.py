@@ -1,7 +1,7 @@
 """The plan of `eval loop --plan`: a TOML file that says what is recorded, trained and played, read and checked.
 
 Its tables hold flags of the commands that play it, by the names of their fields: [record] those of `eval record`,
-[train] and [[rows]] those of `policies.train`, [evaluate] the conditions of a suite (docs/loop.md). Nothing runs here.
+[train] and [[rows]] those of `policies.train`, [evaluate] the conditions of a suite. Nothing runs here.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from arena_newton.files.text import plain_text
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 
-__all__ = ["Plan", "PlanRow", "PlanSettings", "policy_name", "read_plan", "suite_text"]
+__all__ = ["LoopPlan", "PlanRow", "PlanSettings", "policy_name", "read_plan", "suite_text"]
 
 SHIPPED = Path(__file__).resolve().parent
 """Folder of the plans that come with the package."""
@@ -73,7 +73,7 @@ class PlanRow:
 
 
 @dataclass(frozen=True)
-class Plan:
+class LoopPlan:
     """A plan, read and checked."""
 
     path: Path
@@ -81,7 +81,7 @@ class Plan:
     text: bytes
     settings: PlanSettings
     record: RecordOptions
-    """Of all sets; without task, tracker, episodes and folder."""
+    """Flags of all sets; without task, tracker, episodes and folder."""
     at_once: bool
     """True if all attempts of a part are simulated at once."""
     attempts: Mapping[str, int]
@@ -114,7 +114,7 @@ def policy_name(row: PlanRow, seed: int) -> str:
     return f"{row.name}#{seed}"
 
 
-def read_plan(given: str) -> Plan:
+def read_plan(given: str) -> LoopPlan:
     """Read and check a plan: a file, or the name of one that comes with the package.
 
     Raises:
@@ -140,7 +140,7 @@ def read_plan(given: str) -> Plan:
     parts = {task: int(number) for task, number in _numbers(path, content, "parts").items()}
     evaluate = dict(_table(path, content, "evaluate"))
     modes = _names(evaluate.pop("modes", ["base"]))
-    plan = Plan(
+    plan = LoopPlan(
         path=path,
         name=str(name),
         text=path.read_bytes(),
@@ -217,7 +217,7 @@ def _rows(
     return tuple(rows)
 
 
-def _check(plan: Plan) -> None:
+def _check(plan: LoopPlan) -> None:
     """Hold a plan to what the commands take that play it.
 
     Raises:
@@ -253,7 +253,7 @@ def _check(plan: Plan) -> None:
                 raise InputError(f"{plan.path}: [evaluate]: {str(error).replace(f'{path}: ', '')}") from None
 
 
-def suite_text(plan: Plan, row: PlanRow, trainings: Mapping[int, Path]) -> str:
+def suite_text(plan: LoopPlan, row: PlanRow, trainings: Mapping[int, Path]) -> str:
     """The suite file of a row: its trainings on all tasks through all trackers.
 
     Args:

@@ -17,7 +17,7 @@ from arena_newton.eval.loop import plan_report
 from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_requirements import check_folder
 from arena_newton.eval.loop.plan_commands import STAGES, PlanCommand, PlanFolders, plan_commands
-from arena_newton.eval.loop.plan_file import Plan, read_plan
+from arena_newton.eval.loop.plan_file import LoopPlan, read_plan
 from arena_newton.eval.loop.plan_run import CommandPlayer, command_times, stage_seconds
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
@@ -84,7 +84,7 @@ def run(options: LoopOptions) -> int:
         return _play(player, _chosen(commands, options.only), plan, folders, options)
 
 
-def training_minutes(plan: Plan, given: float | None, out: Path, trainings: int, gpus: int) -> float:
+def training_minutes(plan: LoopPlan, given: float | None, out: Path, trainings: int, gpus: int) -> float:
     """Time of each training [min]: the plan's, or an equal part of what recording and building leave of a time for all.
 
     Args:
@@ -107,18 +107,18 @@ def training_minutes(plan: Plan, given: float | None, out: Path, trainings: int,
     return round(left, 3)
 
 
-def _trainings_at_once(plan: Plan, gpus: int) -> int:
+def _trainings_at_once(plan: LoopPlan, gpus: int) -> int:
     """Trainings that run at once, each on GPUs of its own."""
     return max(1, gpus // max(1, plan.settings.gpus))
 
 
-def _at_once(plan: Plan, gpus: int) -> dict[str, int]:
+def _at_once(plan: LoopPlan, gpus: int) -> dict[str, int]:
     """Commands of each stage at once."""
     settings = plan.settings
     return {"record": settings.recordings, "build": settings.datasets, "train": _trainings_at_once(plan, gpus)}
 
 
-def _is_this(out: Path, plan: Plan) -> None:
+def _is_this(out: Path, plan: LoopPlan) -> None:
     """Refuse a folder that holds another plan, or something else.
 
     Raises:
@@ -150,7 +150,7 @@ def _chosen(commands: Sequence[PlanCommand], only: Sequence[str]) -> list[PlanCo
 
 
 def _play(
-    player: CommandPlayer, commands: Sequence[PlanCommand], plan: Plan, folders: PlanFolders, options: LoopOptions
+    player: CommandPlayer, commands: Sequence[PlanCommand], plan: LoopPlan, folders: PlanFolders, options: LoopOptions
 ) -> int:
     """Play commands, and report whatever is there."""
     again = shell_command("arena_newton.eval", "loop", *words(options))

@@ -11,7 +11,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.folders.failure_counts import failure_cells
 from arena_newton.eval.loop.plan_commands import PlanFolders
-from arena_newton.eval.loop.plan_file import Plan, PlanRow
+from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow
 from arena_newton.eval.loop.plan_run import CommandTime, stage_seconds
 from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.journal import write_atomic
@@ -81,7 +81,7 @@ def _condition(cell: PlayedCell) -> str:
     return cell.mode + ("" if cell.tracker in cell.trained_on else ", swapped")
 
 
-def write(plan: Plan, folders: PlanFolders, times: Sequence[CommandTime], command: str) -> list[str]:
+def write(plan: LoopPlan, folders: PlanFolders, times: Sequence[CommandTime], command: str) -> list[str]:
     """Write `plan.md` of what is there.
 
     Returns:
@@ -103,7 +103,7 @@ def write(plan: Plan, folders: PlanFolders, times: Sequence[CommandTime], comman
     return [*lines, f"report: {path}"]
 
 
-def _row(plan: Plan, row: PlanRow, cells: Sequence[PlayedCell]) -> tuple[list[str], list[str]]:
+def _row(plan: LoopPlan, row: PlanRow, cells: Sequence[PlayedCell]) -> tuple[list[str], list[str]]:
     """Section of a row, and its lines for the terminal."""
     conditions = dict.fromkeys(map(_condition, cells))
     sums, missed, lines = [], [], []
@@ -133,7 +133,7 @@ def _row(plan: Plan, row: PlanRow, cells: Sequence[PlayedCell]) -> tuple[list[st
     return text + _failures(cells), lines
 
 
-def _missed(plan: Plan, cells: Sequence[PlayedCell], condition: str, least: float) -> list[str]:
+def _missed(plan: LoopPlan, cells: Sequence[PlayedCell], condition: str, least: float) -> list[str]:
     """Cells of a condition under their bars."""
     found = []
     for task, tracker in dict.fromkeys((cell.task, cell.tracker) for cell in cells):
