@@ -117,9 +117,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of clips and noise")
     parser.add_argument("--seconds", type=float, default=30.0, help="processor time of each method")
     parser.add_argument("--max-steps", type=int, default=40, help="ticks of a clip")
-    args, twist2 = parser.parse_args(), trackers.get("twist2")
+    args = parser.parse_args()
     torch.set_num_threads(1)
-    envs = [ArenaEnv("football", tracker=twist2, worlds=n, rules="released", fast_physics=True) for n in (4, 32)]
+    envs = [ArenaEnv("football", tracker=trackers.get("twist2"), worlds=n, fast_physics=True) for n in (4, 32)]
     torch.manual_seed(1000)
     held_out = clips(32, args.max_steps)
     methods: dict[str, tuple[Callable[[ArenaEnv, int], Iterator[torch.Tensor]], ArenaEnv]]

@@ -42,7 +42,8 @@ def main() -> None:
     def kicked(env: ArenaEnv, values: torch.Tensor) -> torch.Tensor:
         """Where the ball is [m] after the kick if it starts some centimetres farther."""
         start = differentiable.reset_state(env, [SEED] * env.worlds)
-        start = start._replace(qpos=start.qpos.index_add(1, torch.tensor([ball + 1]), 0.01 * values[:, None]))
+        qpos = start.qpos.index_add(1, torch.tensor([ball + 1]), 0.01 * values[:, None])
+        start = differentiable.EngineState(qpos, start.qvel, start.carried)
         given, seeds = plan.repeat(env.worlds, 1, 1), [SEED] * env.worlds
         kick = differentiable.closed_loop(env, given, seeds, args.max_steps, start=start, checkpoint=20)
         return kick.qpos[-1, :, ball + 1]
