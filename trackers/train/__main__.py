@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def without_wandb(logger: str) -> Iterator[None]:
-    """Import rsl_rl without the package wandb, a seventh of the start, unless it is the logger or there already."""
+    """Import rsl_rl without the package wandb, an eighth of the imports, unless it is the logger or there already."""
     hidden = logger != "wandb" and "wandb" not in sys.modules
     if hidden:
         sys.modules["wandb"] = None  # type: ignore[assignment]
