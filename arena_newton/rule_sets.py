@@ -211,7 +211,7 @@ def _departures() -> list[tuple[str, str, str]]:
 
 
 def markdown() -> str:
-    """The documentation page `docs/rules.md`."""
+    """The documentation page `docs/reference/rules.md`."""
     sets = [get(name) for name in names()]
     specs = [tasks.get(t.task) for t in sets[0].tasks]
     items = [
@@ -241,7 +241,7 @@ def markdown() -> str:
         "",
         "`--rules paper` (default) follows the benchmark's paper, made precise where it is silent; `--rules released`",
         "follows its released code. A run prints the set it uses and stores the set's hash with every result.",
-        "This page is generated: `python -m arena_newton.rule_sets > docs/rules.md`.",
+        "This page is generated: `python -m arena_newton.rule_sets > docs/reference/rules.md`.",
         "",
         *Table(("item", *(f"`{s.name}`" for s in sets)), items).compact(),
         "",
@@ -290,7 +290,7 @@ class _NoFlags:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the page `docs/rules.md`.
+    """Print the page `docs/reference/rules.md`.
 
     Returns:
         Exit code: 0, or 2 for an argument, of which there are none.

@@ -9,6 +9,7 @@ temporary folder, which Sphinx turns into HTML. A warning is an error: exit code
 import argparse
 import ast
 import importlib.util
+import itertools
 import os
 import re
 import shutil
@@ -22,27 +23,20 @@ import api_reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-READING = {
-    "Start": "docs/tutorials docs/tour docs/index docs/scope docs/faq",
-    "Concepts": """docs/glossary docs/rules docs/results docs/failures docs/design/tick docs/design/determinism
-        docs/design/identity""",
-    "How-to": """docs/policies docs/checkpoints docs/policy_server docs/serving docs/asking_servers docs/trackers
-        docs/authoring docs/add_a_task docs/research docs/experts docs/recording docs/datasets docs/curation
-        docs/training docs/training_policies docs/recipes docs/loop docs/suites docs/machines docs/comparing
-        docs/sensitivity docs/auditing docs/leaderboard docs/teleoperation docs/gym docs/motions docs/gradients
-        docs/gradient_examples docs/api examples/index""",
-    "Reference": """api/index docs/evaluation docs/certify docs/design/rooms docs/design/tests CONTRIBUTING SECURITY
-        CHANGELOG""",
-    "Results": """docs/results/README docs/results/findings docs/results/reproductions docs/results/trainings
-        docs/results/demonstrations docs/results/failure_labels policies/weights/learned/card
-        eval/tables/paper/README docs/performance docs/results/certificate/certify
-        docs/results/certificate/certify_1 docs/results/certificate/certify_2 docs/results/certificate/certify_3
-        docs/results/certificate/certify_4""",
+PARTS = {"start": "Start", "concepts": "Concepts", "howto": "How-to", "reference": "Reference", "results": "Results"}
+"""Folder of pages → title of a part of the site."""
+SECTIONS = {"evaluate": "Evaluate", "bring": "Bring your own", "train": "Record and train", "program": "Program"}
+"""Folder within a part → title of a group of its pages."""
+BESIDE = {
+    "start": ["docs/index"],
+    "concepts": ["docs/glossary"],
+    "howto": ["examples/index"],
+    "reference": ["api/index", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
+    "results": ["policies/weights/learned/card", "eval/tables/paper/README"],
 }
-"""Part of the site → its pages in the order of reading. A page that is missing here is a warning of Sphinx."""
-EXAMPLES = """first_episode own_policy process_policy word_agent own_tracker own_mode own_metric research drive_by_code
-    usd_variant record_and_build swap aim_a_kick refine_reference fit_motion worst_start
-    compare_runs""".split()
+"""Pages of a part that are made here or lie elsewhere; they come last."""
+INDEX = (ROOT / "docs" / "index.md").read_text()
+EXAMPLES = re.findall(r"^\| \[`(\w+)\.py`\]", INDEX.split("## Examples\n")[1], flags=re.MULTILINE)
 CONFIGURATION = {
     "project": PROJECT["name"],
     "copyright": "The arena_newton contributors, Apache-2.0",
@@ -101,9 +95,21 @@ def page_links(text: str, page: Path, folder: Path) -> str:
     return re.sub(r"\[((?:[^\[\]]|\[[^\]]*\]|!\[[^\]]*\]\([^)]*\))*)\]\(([^)\s]+)\)", one, text)
 
 
-def table_of_contents(pages: Iterable[str], hidden: bool = False) -> str:
+def reading(part: str) -> dict[str, list[str]]:
+    """Title of a group of pages → its pages, in the order in which the index names them.
+
+    A page that the index does not name is in no part, which is a warning of Sphinx.
+    """
+    groups: dict[str, list[str]] = {}
+    for page in dict.fromkeys(re.findall(rf"\]\(({part}/[\w/]+)\.md", INDEX)):
+        groups.setdefault(SECTIONS.get(page.split("/")[1], ""), []).append(f"docs/{page}")
+    groups.setdefault("", []).extend(BESIDE[part])
+    return groups
+
+
+def table_of_contents(pages: Iterable[str], hidden: bool = False, caption: str = "") -> str:
     """A list of the pages below this one."""
-    options = ":hidden:\n" if hidden else ""
+    options = (":hidden:\n" if hidden else "") + (f":caption: {caption}\n" if caption else "")
     return f"\n```{{toctree}}\n{options}:maxdepth: 1\n\n" + "\n".join(pages) + "\n```\n"
 
 
@@ -111,25 +117,26 @@ def example_page(name: str) -> str:
     """An example: what it shows, its pictures, its source."""
     source = (ROOT / "examples" / f"{name}.py").read_text()
     said = ast.get_docstring(ast.parse(source)) or ""
-    pictures = sorted((ROOT / "docs" / "examples").glob(f"{name}*"))
-    shown = "".join(f"\n![What {name}.py shows](../docs/examples/{picture.name})\n" for picture in pictures)
+    pictures = sorted((ROOT / "docs" / "pictures" / "examples").glob(f"{name}*"))
+    shown = "".join(f"\n![What {name}.py shows](../docs/pictures/examples/{picture.name})\n" for picture in pictures)
     return f"# {name}.py\n\n{said}\n{shown}\n```python\n{source}```\n"
 
 
 def collect(folder: Path) -> None:
     """Write all pages of the site as Markdown, with their pictures, into a folder."""
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
-    listed = {ROOT / f"{page}.md" for pages in READING.values() for page in pages.split()}
+    listed = {ROOT / f"{page}.md" for pages in BESIDE.values() for page in pages}
     for path in {ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *filter(Path.is_file, listed)}:
         name = path.relative_to(ROOT)
         text = page_links((ROOT / name).read_text(), name, folder)
         if name.name == "README.md" and name.parent == Path():
-            text += table_of_contents([part.lower() for part in READING], hidden=True)
+            text += table_of_contents(PARTS, hidden=True)
             name = Path("index.md")
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    for part, within in READING.items():
-        (folder / f"{part.lower()}.md").write_text(f"# {part}\n{table_of_contents(within.split())}")
+    for part, title in PARTS.items():
+        lists = [table_of_contents(pages, caption=group) for group, pages in reading(part).items()]
+        (folder / f"{part}.md").write_text("\n".join([f"# {title}", *lists]))
     words = (ROOT / "CONTRIBUTING.md").read_text().split("## Glossary\n")[1].split("\n## ")[0]
     (folder / "docs" / "glossary.md").write_text(f"# Glossary\n{words}")
     (folder / "examples").mkdir(exist_ok=True)
@@ -147,9 +154,9 @@ def collect(folder: Path) -> None:
 def llms(folder: Path) -> str:
     """The file `llms.txt`: the project in a sentence, and each page with its title, by parts of the site."""
     lines = [f"# {PROJECT['name']}", "", f"> {PROJECT['description']}"]
-    for part, pages in READING.items():
-        lines += ["", f"## {part}", ""]
-        for page in pages.split():
+    for part, title in PARTS.items():
+        lines += ["", f"## {title}", ""]
+        for page in itertools.chain.from_iterable(reading(part).values()):
             title = (folder / f"{page}.md").read_text().splitlines()[0].removeprefix("# ")
             lines.append(f"- [{title}]({page}.html)")
     return "\n".join(lines) + "\n"

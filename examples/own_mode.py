@@ -1,7 +1,7 @@
 """A mode of your own: everything is slippery, and objects start as in execution mode.
 
 Shows: that a mode is a record of ranges. A package offers `WET` as an entry point of the group `arena_newton.modes`;
-every command then knows `--mode wet`. More: docs/add_a_task.md.
+every command then knows `--mode wet`. More: docs/howto/bring/add_a_task.md.
 
     python examples/own_mode.py
 """

@@ -1,7 +1,7 @@
 """A policy of your own: squat to a depth that follows from the episode's seed, up and down.
 
 Shows: memory per world, masks, noise from the seed, the conformance checks, episodes in three worlds at once, and the
-name under which the command line knows it. Another program finds it through an entry point; see docs/policies.md.
+name under which the command line knows it. Other programs find it by an entry point; see docs/howto/bring/policies.md.
 
     python examples/own_policy.py
 """

@@ -1,6 +1,7 @@
 """A tracker of your own: TWIST2 with smoothed joint targets.
 
-Shows: a tracker's methods, a memory that obeys masks, the conformance checks, a first test. More: docs/trackers.md.
+Shows: a tracker's methods, a memory that obeys masks, the conformance checks, a first test.
+More: docs/howto/bring/trackers.md.
 
     python examples/own_tracker.py
 """

@@ -1,7 +1,7 @@
 """A USD variant: a green sofa under warm light, in a layer of your own; rules and policies stay as they are.
 
 Shows: that a scene is data. The layer sublayers the task's scene and says only what is different; it is validated,
-looked at and run without a line of code. All about it is in docs/authoring.md.
+looked at and run without a line of code. All about it is in docs/howto/bring/authoring.md.
 
     python examples/usd_variant.py --out usd_variant
 """

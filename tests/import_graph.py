@@ -1,6 +1,6 @@
 """Imports of the product: read from the sources, checked by `test_house.py`, and drawn by rooms.
 
-    python tests/import_graph.py --out docs/design/imports_after.png
+    python tests/import_graph.py --out docs/pictures/imports_after.png
     python tests/import_graph.py --root ../before --out imports_before.png    # another checkout
 
 A box is a room, or a single module of a folder that has rooms; it is above all that it imports. An arrow is as thick as

@@ -176,8 +176,8 @@ def test_rooms_are_small():
 
 
 def test_the_page_of_rooms_names_each():
-    """`docs/design/rooms.md` lists the rooms of each folder from the bottom to the top, and the names at its places."""
-    page = (ROOT / "docs" / "design" / "rooms.md").read_text()
+    """`docs/reference/rooms.md` lists the rooms of each folder from the bottom to the top, and where names are."""
+    page = (ROOT / "docs" / "reference" / "rooms.md").read_text()
     packages = {module.name for module in known().values() if module.path.name == "__init__.py"}
     for folder in (PACKAGE, *(f"{PACKAGE}.{name}" for name in ("data", "trackers", "policies", "eval"))):
         title = folder.replace(".", "/") if folder.endswith("data") else f"{folder.split('.')[-1]}/"

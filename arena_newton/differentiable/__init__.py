@@ -1,6 +1,6 @@
 """Gradients for torch: exact ones of kernels, engine `mujoco` and a ball's flight, estimated ones of the closed loop.
 
-`docs/gradients.md` says what is exact, what is estimated and what has no gradient.
+`docs/howto/program/gradients.md` says what is exact, what is estimated and what has no gradient.
 """
 
 from arena_newton.differentiable.closed_loop import Rolled, closed_loop, reset_state

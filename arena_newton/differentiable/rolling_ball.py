@@ -37,7 +37,8 @@ MOST_DAMPING = 0.75 / SPRING
 a restitution of 0.065."""
 SLIP_DECAY = 7.4
 """Rate at which friction takes the slip of a ball below the Coulomb limit [1/s]: what the engines' regularised friction
-does to a ball that starts at 2 to 6 m/s (`docs/gradients.md`). A stiff friction would roll the ball 8 cm shorter."""
+does to a ball that starts at 2 to 6 m/s (`docs/howto/program/gradients.md`). A stiff friction would roll the ball 8 cm
+shorter."""
 SLIP_MASS = 2.0 / 7.0
 """Part of a solid ball's mass that a force at its rim moves: 1 / (1 + m·r²/I) with I = 2/5·m·r²."""
 

@@ -21,7 +21,7 @@ import torch
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
 
-__all__ = ["SEMANTIC_COLOURS", "Changes", "changed_looks", "hue_lacks", "luminance", "palette", "recoloured"]
+__all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "hue_lacks", "luminance", "palette", "recoloured"]
 __all__ += ["seen_colours"]
 
 SEMANTIC_COLOURS = (

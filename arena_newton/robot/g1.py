@@ -128,7 +128,7 @@ class DriveGains:
     finger_kd: float = 0.2
     """Finger damping [N·m·s/rad]."""
     finger_effort: float = 2.45
-    """Finger torque limit [N·m]: Unitree's of thumb_0; in its model the other six have 1.4 (docs/rules.md)."""
+    """Finger torque limit [N·m]: Unitree's of thumb_0; of its other six 1.4 (docs/reference/rules.md)."""
     finger_armature: float = 0.01
     """Finger rotor inertia [kg·m²]."""
     armature: tuple[float, ...] | None = None

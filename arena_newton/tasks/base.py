@@ -306,7 +306,7 @@ class Required:
 
     path: str
     kind: Kind
-    """Required kind of prim, as docs/authoring.md describes them."""
+    """Required kind of prim, as docs/howto/bring/authoring.md describes them."""
     variants: tuple[str, ...] = ()
     """Variants of `semantics` that need it; empty: all of them."""
 
@@ -353,7 +353,7 @@ class TaskSpec:
     """Factor of `noise_levels.NoiseLevels` when its demonstrations are recorded: as much as an expert survives.
 
     Measured, engine mujoco, tracker sonic, successes at 0, 0.35, 0.5 and 1: P&PBox 7/8, 6/8, 8/12, 2/12; DoubleDesk
-    8/8, 8/8, 11/12, 6/12 (docs/recording.md). Tasks that grasp take 0.5, the others bear it whole."""
+    8/8, 8/8, 11/12, 6/12 (docs/howto/train/recording.md). Tasks that grasp take 0.5, the others bear it whole."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()
@@ -365,8 +365,8 @@ class TaskSpec:
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
     recolour: Mapping[str, float] = field(default_factory=dict)
-    """Prim → probability with which changed looks may give it another colour (docs/datasets.md): 0 where the
-    instruction names its colour or nothing else tells it apart, little where a hand must find it; 1 of all others."""
+    """Prim → probability with which changed looks may give it another colour (docs/howto/train/datasets.md): 0 where
+    the instruction names its colour or nothing else tells it apart, little where a hand must find it; else 1."""
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)
     """Mode → what it changes in this task in particular, in words, where the rule sets differ."""
 

@@ -20,8 +20,8 @@ __all__ = ["AuditOptions", "run"]
 class AuditOptions:
     """Check results folders: lines, links, actions, tables; episodes played again, their policy asked again.
 
-    Four levels: self-reported (something contradicts), consistent, replayed, re-run (docs/auditing.md). Nothing in the
-    folders is written. Exit code 1 where something contradicts, a line for each contradiction.
+    Four levels: self-reported (something contradicts), consistent, replayed, re-run (docs/howto/evaluate/auditing.md).
+    Nothing in the folders is written. Exit code 1 where something contradicts, a line for each contradiction.
     """
 
     head: str | None = None

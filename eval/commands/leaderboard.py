@@ -89,7 +89,8 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
 class BundleOptions:
     """Make an entry of the leaderboard from a run: its journal, some actions and strips as bundle.zip, and entry.toml.
 
-    entry.toml has empty keys that its author fills in; `eval leaderboard build` names them (docs/leaderboard.md).
+    entry.toml has empty keys that its author fills in; `eval leaderboard build` names them
+    (docs/howto/evaluate/leaderboard.md).
     """
 
     out: str = "leaderboard/mine"

@@ -57,7 +57,7 @@ class BoardEntry:
     bundle: Hash = ""
     """SHA-256 of `bundle.zip`."""
     head: Text = ""
-    """Head of its journals (docs/auditing.md)."""
+    """Head of its journals (docs/howto/evaluate/auditing.md)."""
     checked: Text = ""
     """Command and day of the check, by the maintainer who raised the level."""
 

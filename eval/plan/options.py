@@ -137,7 +137,8 @@ class Recording:
     record_depth: bool = False
     """Write the depth of each picture too, float16 [m]; 100 MB per 1,000 ticks at 224x224 before compression."""
     record_looks: int = 0
-    """Write what every fourth picture shows and its light under so many second lights, 1 or 2 (docs/recording.md)."""
+    """Write what every fourth picture shows and its light under so many second lights, 1 or 2
+    (docs/howto/train/recording.md)."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,8 @@ class RunOptions(
     """Write each episode's canonical actions (about 50 kB), for --policy replay:<results>/actions through another
     tracker; in a run of several trackers actions/<tracker>."""
     failures: bool = False
-    """Keep the signals that tell why an episode failed (docs/failures.md); looks at the head camera twice a second."""
+    """Keep the signals that tell why an episode failed (docs/concepts/failures.md); looks at the head camera
+    twice a second."""
     accept_versions: bool = False
     """Continue a folder that was begun with other versions of the libraries; the journal then names both."""
     skip_broken: bool = False
@@ -304,7 +306,7 @@ class _Demonstrations:
     """Write the depth of each picture too, float16 [m]."""
     looks: int = 0
     """Write what every fourth picture shows and its light under so many second lights, 1 or 2, so that a training can
-    change its looks (docs/recording.md)."""
+    change its looks (docs/howto/train/recording.md)."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def _no_recorders(env: World) -> Sequence[Recorder]:
 
 @dataclass(frozen=True)
 class Factories:
-    """Constructors of a run's parts, for a program that puts its own in (docs/research.md).
+    """Constructors of a run's parts, for a program that puts its own in (docs/howto/bring/research.md).
 
     Other processes (`--jobs`) import them by module and name, so there they must not be of the program's main module.
     """

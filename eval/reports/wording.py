@@ -108,7 +108,7 @@ def rules_that_ran(rule_set: Mapping[str, str], tasks: Sequence[str]) -> list[tu
         named = {*re.findall(r"\w+", plain(item)), owners.get(plain(item), "")} & set(known)
         if named and not named & set(tasks):
             continue
-        text = plain(message).replace("see the ranges below", "ranges: docs/rules.md")
+        text = plain(message).replace("see the ranges below", "ranges: docs/reference/rules.md")
         # A remark on other tasks alone is left out; lists of tasks or of their objects keep what belongs to the run.
         for remark in re.findall(r" \([^()]*\)", text):
             named_here = set(re.findall(r"\w+", remark)) & set(known)

@@ -1,6 +1,7 @@
 """The suite file: a TOML table of policies, trackers, tasks, modes and rules, read and checked.
 
-docs/suites.md describes its tables. Nothing is expanded here and no checkpoint is looked for: see `matrix_cells`.
+docs/howto/evaluate/suites.md describes its tables. Nothing is expanded here and no checkpoint is looked for: see
+`matrix_cells`.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ MAX_ENTRIES = 1000
 policies, three seeds."""
 CONDITIONS = (
     *("seeds", "repeats", "max_steps", "worlds", "engine", "device", "drive", "fast_physics", "skip_broken"),
-    *("video", "strip", "video_episodes", "video_size", "follow", "actions"),
+    *("video", "strip", "video_episodes", "video_size", "follow", "actions", "failures"),
     *("remote_timeout", "remote_retries", "remote_sequential", "remote_insecure"),
 )
 """Flags of `eval run` that a suite may set for all its cells, in [defaults]."""

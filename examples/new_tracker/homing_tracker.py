@@ -1,6 +1,6 @@
 """TWIST2 with state estimation and a look ahead, as a package: what its network cannot see, a loop around it can.
 
-Shows: `needs`, `lookahead`, an argument and an entry point. More: docs/trackers.md.
+Shows: `needs`, `lookahead`, an argument and an entry point. More: docs/howto/bring/trackers.md.
 
     uv pip install -e examples/new_tracker
     python -m arena_newton doctor --tracker homing:0.5 --stand

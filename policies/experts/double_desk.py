@@ -6,7 +6,7 @@ picture whenever they are used, and true positions stand in for what the picture
 hand is read from its distance to the palm, which the camera sees as well.
 
 A policy without memory learns from these demonstrations. It knows neither phase nor clock, so that nothing may wait for
-what it cannot see (docs/experts.md):
+what it cannot see (docs/howto/train/experts.md):
 
 - The hand begins to hover over the hammer while the robot still walks its last steps.
 - While the left hand grasps, and again while it lets go, the free right wrist rolls steadily: time can be seen on it.

@@ -15,7 +15,8 @@ __all__ = ["BEYOND", "Walk", "along", "beyond", "paced", "passing"]
 
 BEYOND = 0.06
 """Distance beyond a position to which a robot is led that goes on there while it still walks [m]: a policy that learns
-from demonstrations knows no phase and no clock, and would wait for the last centimetres for ever (docs/experts.md)."""
+from demonstrations knows no phase and no clock, and would wait for the last centimetres for ever
+(docs/howto/train/experts.md)."""
 
 HEADING_GAIN = 1.5
 """Yaw rate for a heading error on a line [1/s]."""

@@ -1,7 +1,7 @@
 """The original benchmark's HTTP protocol: JSON bodies of `/reset`, `/infer` and `/config` to records and back.
 
-docs/policy_server.md has the fields. `world`, `seed`, `step` and `instruction` are ours; the original's client does not
-send them.
+docs/howto/bring/policy_server.md has the fields. `world`, `seed`, `step` and `instruction` are ours; the original's
+client does not send them.
 Source: `lerobot/scripts/serve_lerobot_vla_http.py` of the original.
 """
 

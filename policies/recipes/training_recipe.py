@@ -1,7 +1,7 @@
 """Training recipe of a policy: one record, by family and name.
 
 `paper` is read from the file of the family, a configuration of LeRobot's own trainer, so that both trainers have the
-same numbers. The other recipes say only what they change (docs/recipes.md gives the reasons).
+same numbers. The other recipes say only what they change (docs/howto/train/recipes.md gives the reasons).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol (docs/policy_server.md).
+"""The policy that runs elsewhere: a client of the original benchmark's HTTP protocol.
 
-A server of that protocol knows one robot only, so there is one request per world. `from_spec` also knows the protocols
-of other servers (docs/asking_servers.md), each in its own module `remote_*`.
+docs/howto/bring/policy_server.md has its fields. A server of that protocol knows one robot only, so there is one
+request per world. `from_spec` also knows the protocols of other servers (docs/howto/bring/asking_servers.md), each in
+its own module `remote_*`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The policy that is a program of this machine: JSON lines on its standard input and output (docs/policy_server.md).
+"""The policy that is a program of this machine: JSON lines on its standard input and output.
 
-The messages are those of the original's HTTP protocol; one program answers for all worlds, one query after the other.
+The messages (docs/howto/bring/policy_server.md) are those of the original's HTTP protocol; one program answers for all
+worlds, one query after the other.
 """
 
 from __future__ import annotations

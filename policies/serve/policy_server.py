@@ -2,7 +2,8 @@
 
 A policy's memory belongs to the row, so to the session: `begin` clears it with the episode's seed, and a session that
 leaves frees its row. What a session is answered does not depend on which others asked with it, as far as the policy
-keeps its promises (docs/policy_server.md). One thread has the policy; every connection has its own and waits for it.
+keeps its promises (docs/howto/bring/policy_server.md). One thread has the policy; every connection has its own
+and waits for it.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,9 @@ __all__ = [
     "check_choices",
     "check_numbers",
     "check_teachable",
+    "look_changes",
     "look_fractions",
+    "recipe_values",
     "task_weights",
 ]
 
@@ -29,6 +32,12 @@ ROBOT_CAMERAS = tuple(name for name in CAMERAS if name != "world")
 """Cameras that policies are trained on: those that the robot carries."""
 BALANCES = ("picture", "task")
 """Draws of the samples."""
+FLAGGED = {
+    **{name: f"--{name.replace('_', '-')}" for name in ("steps", "batch_size", "lr", "seed", "labels")},
+    **{"family": "--policy", "name": "--recipe", "use_task_vector": "--task-vector", "lr_backbone": "--lr"},
+    "network": "network.<field>=",
+}
+"""Fields of a recipe that a flag of their own says, and that flag."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,11 @@ class PolicyTrainOptions:
     looks: Several[str] = ()
     """Fraction of the samples whose looks are changed, and that of single tasks, as 0.6 double_desk=0.3; of datasets
     that were recorded with `eval record --looks`."""
+    look_changes: Several[str] = ()
+    """Probabilities of the kinds of change in such a sample, as light=0 things=0; the usual ones of those that are not
+    named: colours patterns light things rectangles exposure."""
+    recipe_values: Several[str] = ()
+    """Values of the recipe that no other flag has, as frozen_norms=0.3 shift_px=0 network.dim_model=384."""
     task_vector: bool = False
     """Give the policy a one-hot vector of its tasks; recipes that need one have it without this flag."""
     tracker_vector: bool = True
@@ -169,6 +183,40 @@ def look_fractions(given: Sequence[str]) -> tuple[float, dict[str, float]]:
     return found.pop("", 0.0), found
 
 
+def look_changes(given: Sequence[str]) -> dict[str, float]:
+    """Probabilities of kinds of change as they are typed; their names are checked where looks are made.
+
+    Raises:
+        InputError: One is no name and probability.
+    """
+    expected = "a kind of change and a probability, as light=0"
+    return _task_numbers("--look-changes", given, expected, lambda kind, number: bool(kind) and 0.0 <= number <= 1.0)
+
+
+def recipe_values(given: Sequence[str]) -> dict[str, object]:
+    """Fields of a recipe as they are typed: JSON, or text; those of the network under `network`.
+
+    Raises:
+        InputError: One is no field and value, is given twice, or has a flag of its own.
+    """
+    found: dict[str, object] = {}
+    network: dict[str, object] = {}
+    for text in given:
+        name, equals, typed = text.partition("=")
+        try:
+            value = json.loads(typed)
+        except ValueError:
+            value = typed
+        fields = network if name.startswith("network.") else found
+        key = name.removeprefix("network.")
+        if not (equals and key) or key in fields or value in ("", None):
+            raise InputError(f"--recipe-values {text}: expected a field once and its value, as frozen_norms=0.3")
+        if fields is found and key in FLAGGED:
+            raise InputError(f"--recipe-values {text}: {FLAGGED[key]} says it")
+        fields[key] = value
+    return found | ({"network": network} if network else {})
+
+
 def _task_numbers(
     flag: str, given: Sequence[str], expected: str, fits: Callable[[str, float], bool]
 ) -> dict[str, float]:
@@ -220,6 +268,9 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     if options.labels not in ("", *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)
+    if look_changes(options.look_changes) and not options.looks:
+        raise InputError("--look-changes: belongs to --looks, which is not given")
+    recipe_values(options.recipe_values)
     named = {*options.cameras}
     if not named or len(named) < len(options.cameras) or named - {*ROBOT_CAMERAS}:
         expected = f"expected different ones of {' '.join(ROBOT_CAMERAS)}"

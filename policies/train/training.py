@@ -16,6 +16,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.files.stored_json import check_types
 from arena_newton.files.text import counted
 from arena_newton.physics.devices import torch_device
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, vector_of
@@ -28,7 +29,7 @@ from arena_newton.policies.train.frames.frame_store import FrameStore, is_pad, l
 from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_fractions, task_weights
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_changes, look_fractions, recipe_values, task_weights
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
@@ -124,7 +125,8 @@ def _train(
             on_frames=bar.update,
         )
     if options.looks:
-        looks = load_looks(datasets, store, *look_fractions(options.looks), jobs=jobs, network=network)
+        changes = look_changes(options.look_changes)
+        looks = load_looks(datasets, store, *look_fractions(options.looks), changes, jobs=jobs, network=network)
         store = dataclasses.replace(store, looks=looks)
     if speaks:
         size = store.pictures.numel() / 1e9
@@ -195,6 +197,9 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
     if options.weights:
         named = with_pretrained(named)
     changes: dict[str, object] = {"lr_backbone": named.lr_backbone}
+    if options.recipe_values:
+        values = recipe_values(options.recipe_values)
+        changes |= check_types("--recipe-values", values, TrainingRecipe)
     if options.labels:
         changes["labels"] = options.labels
         # Integrated yaw rates drift; a recipe of v3.1 says nothing of it.

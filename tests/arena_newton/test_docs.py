@@ -16,15 +16,21 @@ from arena_newton.eval import __main__ as evaluation
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
+PARTS = "start concepts howto reference results".split()
 FOLDERS = "arena_newton eval policies trackers kernels usd_scenes tests benchmarks examples docs".split()
 
 
 def test_the_index_names_every_page():
-    """Every page of docs/ is linked from the index, and the site has it in its order of reading."""
+    """Every page of docs/ lies in the folder of a part and is linked from the index, which gives the order."""
     linked = set(re.findall(r"\]\(([\w./]+\.md)", (ROOT / "docs" / "index.md").read_text()))
-    assert linked >= {str(page.relative_to(ROOT / "docs")) for page in DOCS} - {"index.md"}
-    ordered = set(re.findall(r"[\w/]+", (ROOT / "docs" / "build.py").read_text()))
-    assert ordered >= {str(page.relative_to(ROOT).with_suffix("")) for page in DOCS}
+    pages = {str(page.relative_to(ROOT / "docs")) for page in DOCS} - {"index.md"}
+    assert linked >= pages and {page.split("/")[0] for page in pages} == set(PARTS)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *DOCS], ids=lambda page: page.stem)
+def test_pages_are_short(page):
+    """A page has at most 250 lines, the README 150."""
+    assert len(page.read_text().splitlines()) <= (150 if page.parent == ROOT else 250)
 
 
 def anchors(page: Path) -> set[str]:
@@ -71,11 +77,11 @@ def test_the_site(tmp_path):
     assert all(f'id="arena_newton.{name}"' in public for name in ("ArenaEnv", "ArenaEnv.step", "Rollout.run"))
 
 
-def test_commands_of_the_index_exist():
-    """The index lists every command of the one command line, and no other."""
+def test_commands_of_the_page_exist():
+    """The page of commands lists every command of the one command line, and no other."""
     from arena_newton.__main__ import COMMANDS
 
-    table = (ROOT / "docs" / "index.md").read_text().split("## Commands")[1].split("## ")[0]
+    table = (ROOT / "docs" / "reference" / "commands.md").read_text()
     first = "\n".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
     listed = re.findall(r"`([^`]+)`", first)
     for command in COMMANDS:
@@ -87,15 +93,17 @@ def test_commands_of_the_index_exist():
 
 
 def test_the_world_from_python():
-    """Every block of docs/api.md runs, one after the other, and gives what the page says."""
+    """Every block of docs/howto/program/api.md runs, one after the other, and gives what the page says."""
     blocks = re.findall(
-        r"^```python\n(.*?)^```$", (ROOT / "docs" / "api.md").read_text(), flags=re.DOTALL | re.MULTILINE
+        r"^```python\n(.*?)^```$",
+        (ROOT / "docs" / "howto" / "program" / "api.md").read_text(),
+        flags=re.DOTALL | re.MULTILINE,
     )
     for module in re.findall(r"^from (arena_newton[\w.]*) import", "".join(blocks), flags=re.MULTILINE):
         assert module in ("arena_newton", "arena_newton.kernels.rules"), "not the package's public names"
     world: dict = {"__name__": "docs_api"}
     for number, block in enumerate(blocks, start=1):
-        exec(compile(block, f"docs/api.md, block {number}", "exec"), world)
+        exec(compile(block, f"docs/howto/program/api.md, block {number}", "exec"), world)
     observation, env = world["observation"], world["env"]
     assert observation.state.shape == (2, 64) and observation.image.shape == (2, 64, 64, 3)
     assert observation.image.dtype == torch.uint8 and observation.image.float().std() > 5.0
@@ -110,7 +118,7 @@ def test_the_world_from_python():
     assert ball.isfinite().all() and ball.norm(dim=1).min() > 0.5
 
 
-TUTORIALS = (ROOT / "docs" / "tutorials.md").read_text().split("\n## ")[1:]
+TUTORIALS = (ROOT / "docs" / "start" / "tutorials.md").read_text().split("\n## ")[1:]
 
 
 @pytest.mark.release
@@ -122,7 +130,7 @@ def test_a_tutorial_runs_as_it_stands(part, tmp_path, monkeypatch, capsys):
         if kind == "usda":
             Path(re.search(r"Save this as `([\w.]+)`", part)[1]).write_text(block)
         elif kind == "python":
-            exec(compile(block, "docs/tutorials.md", "exec"), {"__name__": "tutorial"})
+            exec(compile(block, "docs/start/tutorials.md", "exec"), {"__name__": "tutorial"})
         else:
             for line in block.splitlines():
                 python, minus, module, *flags = shlex.split(line)

@@ -123,9 +123,13 @@ def test_a_landing_does_not_move_with_the_vertical_speed():
     found = slopes(velocity.detach(), 50, 0.02)[:, 1]
     assert float(grad[1]) == pytest.approx(float(found[1]), rel=1e-3)
     assert abs(float(grad[2]) - float(found[2])) > 0.1
-    page = (Path(__file__).parents[2] / "docs" / "gradient_examples.md").read_text().replace("−", "-")
+    page = (
+        (Path(__file__).parents[2] / "docs" / "howto" / "program" / "gradient_examples.md")
+        .read_text()
+        .replace("−", "-")
+    )
     told = re.search(r"\((\S+) against (\S+) by differences, 1 s .*?\((\S+) against (\S+)\)", page, re.DOTALL)
-    assert told, "docs/gradient_examples.md no longer says what a bounce does"
+    assert told, "docs/howto/program/gradient_examples.md no longer says what a bounce does"
     measured = (grad[1], found[1], grad[2], found[2])
     assert [float(number) for number in told.groups()] == [pytest.approx(float(one), abs=0.006) for one in measured]
 
@@ -262,7 +266,9 @@ def test_newtons_featherstone_has_the_slope_of_the_wrong_sign():
     moved = [pushed(angle + shift)[1].joint_qd.numpy()[0] for shift in (-0.01, 0.01)]
     slope = step * length * force * np.sin(angle) / (inertia + mass * length**2)
     assert (moved[1] - moved[0]) / 0.02 == pytest.approx(slope, rel=1e-3)
-    assert before.joint_q.grad.numpy()[0] == pytest.approx(-slope, rel=1e-3), "mended: docs/gradients.md must say so"
+    assert before.joint_q.grad.numpy()[0] == pytest.approx(-slope, rel=1e-3), (
+        "mended: docs/howto/program/gradients.md must say so"
+    )
 
 
 def test_worlds_differ_by_their_actions_alone():
@@ -280,18 +286,18 @@ def test_worlds_differ_by_their_actions_alone():
 
 
 def test_the_documented_programs_run():
-    """The blocks of docs/gradients.md give finite slopes: of a tick, of a closed loop, and of speed and height."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "gradients.md").read_text()
+    """The blocks of docs/howto/program/gradients.md give finite slopes: of a tick, a closed loop, speed and height."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "howto" / "program" / "gradients.md").read_text()
     tick, loop, estimate = re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE)
     world: dict = {"__name__": "docs_gradients"}
-    exec(compile(tick, "docs/gradients.md", "exec"), world)
+    exec(compile(tick, "docs/howto/program/gradients.md", "exec"), world)
     for leaf in (world["targets"], world["factors"]):
         assert leaf.grad.isfinite().all() and leaf.grad[0].abs().max() > 0.0
-    exec(compile(loop, "docs/gradients.md", "exec"), world)
+    exec(compile(loop, "docs/howto/program/gradients.md", "exec"), world)
     for leaf in (world["plan"], world["qpos"], world["rolled"].factors):
         assert leaf.grad.isfinite().all()
     assert world["qpos"].grad.abs().max() > 0.1
-    exec(compile(estimate, "docs/gradients.md", "exec"), world)
+    exec(compile(estimate, "docs/howto/program/gradients.md", "exec"), world)
     found = world["found"]
     assert found.gradient.shape == found.bend.shape == (2,) and found.gradient.isfinite().all()
     assert found.gradient[0] != 0.0

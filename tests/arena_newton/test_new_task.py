@@ -280,10 +280,11 @@ def missing_rows(spec, own=True):
         rows |= {
             "arena_newton/tasks/__init__.py: OWN": name in tasks.OWN,
             f"scene_builders/{name}.py: build": (ROOT / "scene_builders" / f"{name}.py").is_file(),
-            "docs/policies.md: table of instructions": f"| {spec.instruction} |" in page_of("policies"),
-            "docs/rules.md: python -m arena_newton.rule_sets": f"| {name} | {spec.predicates[0].name} |"
-            in page_of("rules"),
-            "docs/experts.md": name in page_of("experts"),
+            "docs/howto/bring/policies.md: table of instructions": f"| {spec.instruction} |"
+            in page_of("howto/bring/policies"),
+            "docs/reference/rules.md: python -m arena_newton.rule_sets": f"| {name} | {spec.predicates[0].name} |"
+            in page_of("reference/rules"),
+            "docs/howto/train/experts.md": name in page_of("howto/train/experts"),
         }
     return [row for row, there in rows.items() if not there]
 
@@ -302,8 +303,8 @@ def test_every_task_of_the_tree_has_each_row(bell):
     assert files == {
         "arena_newton/tasks/__init__.py",
         "arena_newton/tasks/bell.py",
-        "docs/experts.md",
-        "docs/policies.md",
-        "docs/rules.md",
+        "docs/howto/train/experts.md",
+        "docs/howto/bring/policies.md",
+        "docs/reference/rules.md",
         "scene_builders/bell.py",
     }

@@ -11,11 +11,11 @@ from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.rules import rule_types
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "rules.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "rules.md"
 
 
 def test_documentation_page_matches_the_rules(capsys):
-    """docs/rules.md is what `python -m arena_newton.rule_sets` prints."""
+    """docs/reference/rules.md is what `python -m arena_newton.rule_sets` prints."""
     assert rule_sets.main([]) == 0
     assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""Statements of docs/policies.md and docs/policy_server.md hold: tables, the server, the policy in Python."""
+"""Statements of policies.md and policy_server.md in docs/howto/bring/ hold: tables, server, policy in Python."""
 
 import re
 import threading
@@ -24,7 +24,7 @@ from arena_newton.policies.remote.arena_client import (
 from arena_newton.robot import canonical, g1
 
 ROOT = Path(__file__).parents[2]
-TEXT = "".join((ROOT / "docs" / page).read_text() for page in ("policies.md", "policy_server.md"))
+TEXT = "".join((ROOT / "docs" / "howto" / "bring" / page).read_text() for page in ("policies.md", "policy_server.md"))
 PLAIN = " ".join(TEXT.split())
 SQUAT, *_, SERVER = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
@@ -122,9 +122,9 @@ def test_server_of_the_text(monkeypatch):
     assert (ROOT / "policies" / "serve_example.py").read_text().endswith(SERVER)
     monkeypatch.setattr("sys.argv", ["serve_example", "--help"])
     with pytest.raises(SystemExit, match="0"):
-        exec(compile(SERVER, "docs/policy_server.md", "exec"), {"__name__": "__main__"})
+        exec(compile(SERVER, "docs/howto/bring/policy_server.md", "exec"), {"__name__": "__main__"})
     names = {"__name__": "server"}
-    exec(compile(SERVER, "docs/policy_server.md", "exec"), names)
+    exec(compile(SERVER, "docs/howto/bring/policy_server.md", "exec"), names)
     names["Handler"].log_message = lambda *_: None
     server = names["Server"](("127.0.0.1", 0), names["Handler"])
     threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
@@ -149,7 +149,7 @@ def test_server_of_the_text(monkeypatch):
 def test_policy_in_python(monkeypatch):
     """The policy of the text runs, found by its name."""
     names = {}
-    exec(compile(SQUAT, "docs/policies.md", "exec"), names)
+    exec(compile(SQUAT, "docs/howto/bring/policies.md", "exec"), names)
     monkeypatch.setattr(policies.base.POLICIES, "_registered", {})
     policies.register("squat", names["Squat"])
     policy = policies.get("squat:0.2")

@@ -278,9 +278,9 @@ def test_semantic_modes_change_looks_and_clutter_alone(task):
 
 
 def test_variant_by_override_alone(tmp_path):
-    """The example of docs/authoring.md: a layer over the scene paints, moves and adds without code."""
+    """The example of docs/howto/bring/authoring.md: a layer over the scene paints, moves and adds without code."""
     own = os.path.relpath(SCENES.resolve() / "sit_sofa" / "scene.usda", tmp_path)
-    page = (Path(__file__).parents[2] / "docs" / "authoring.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "bring" / "authoring.md").read_text()
     example = page.split("```usda\n")[1].split("```")[0].replace("../usd_scenes/sit_sofa/scene.usda", own)
     room = tmp_path / "my_room.usda"
     room.write_text(example)

@@ -16,7 +16,7 @@ from arena_newton.tasks.base import SCENES
 from arena_newton.usd_scenes.__main__ import main
 from arena_newton.usd_scenes.validate import check, layers, task_of, validate
 
-AUTHORING = Path(__file__).parents[2] / "docs" / "authoring.md"
+AUTHORING = Path(__file__).parents[2] / "docs" / "howto" / "bring" / "authoring.md"
 SNIPPETS = re.findall(r"^```usda\n(.*?)^```", AUTHORING.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 HEAD = """#usda 1.0
@@ -419,7 +419,7 @@ def test_unknown_variants_are_named(tmp_path, body, prim, words):
 
 @pytest.mark.parametrize("number", range(len(SNIPPETS)))
 def test_snippets_of_the_authoring_guide_are_usd(tmp_path, number):
-    """Whole layers of docs/authoring.md validate where the guide puts them; fragments parse inside the world."""
+    """Layers of docs/howto/bring/authoring.md validate where the guide puts them; fragments parse in the world."""
     text = SNIPPETS[number]
     if not text.startswith("#usda"):
         Sdf.Layer.CreateAnonymous(".usda").ImportFromString(f'#usda 1.0\nover "World"\n{{\n{text}\n}}\n')

@@ -1,6 +1,6 @@
 """Are gradients that are called exact those that differences estimate? Conversion, ticks, margins, the ball.
 
-A tick of engine `warp` has no exact gradient (`docs/gradients.md`).
+A tick of engine `warp` has no exact gradient (`docs/howto/program/gradients.md`).
 """
 
 from __future__ import annotations

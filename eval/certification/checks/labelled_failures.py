@@ -18,7 +18,7 @@ from arena_newton.pages.tables import Table
 __all__ = ["LABELLED", "JudgeAgreement", "LabelledFailure", "agreements", "labelled_failures", "labelled_sheets"]
 
 LABELLED = Path(__file__).parent / "labelled"
-"""Folder of the journal's lines and of the readers' answers; docs/failures_labelled/ has a strip of each episode."""
+"""Folder of the journal's lines and of the readers' answers; docs/results/failures_labelled/ has strips of them."""
 
 
 @dataclass(frozen=True)

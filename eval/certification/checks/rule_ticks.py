@@ -1,7 +1,7 @@
 """Does an episode succeed at the tick at which its rule holds? The paper's rules again, from the state of every tick.
 
-Sentences of `docs/rules.md` as NumPy, with their numbers written out: nothing of the judge's kernels is used, and a
-rule that confirms a tick early or late ends another tick.
+Sentences of `docs/reference/rules.md` as NumPy, with their numbers written out: nothing of the judge's kernels is used,
+and a rule that confirms a tick early or late ends another tick.
 """
 
 from __future__ import annotations

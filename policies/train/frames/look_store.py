@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ import torch
 from arena_newton.data.readers.dataset_files import DatasetFiles
 from arena_newton.data.readers.looks import dataset_looks
 from arena_newton.errors import InputError
+from arena_newton.pictures.changed_looks import USUAL, Changes
 from arena_newton.policies.train.frames.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
 from arena_newton.policies.train.frames.demonstration_rows import DatasetRows
 from arena_newton.policies.train.frames.frame_store import FrameStore, free_memory
@@ -38,6 +41,8 @@ class LookStore:
     """First shape of the object that each shape is part of, int64, shape [tables, 256]."""
     fractions: torch.Tensor
     """Fraction of the samples of each row's task whose looks change, float32, shape [rows]."""
+    changes: Changes = USUAL
+    """Probabilities of the kinds of change."""
 
     def chosen(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Samples whose looks change, drawn from the device's default generator.
@@ -57,6 +62,7 @@ def load_looks(
     store: FrameStore,
     fraction: float,
     fractions: Mapping[str, float],
+    changes: Mapping[str, float] = MappingProxyType({}),
     *,
     jobs: int = 0,
     network: int = 0,
@@ -68,12 +74,18 @@ def load_looks(
         store: Their pictures.
         fraction: Fraction of the samples whose looks change.
         fractions: The same of single tasks.
+        changes: Probabilities of kinds of change, of those that are not the usual ones.
         jobs: Cores that decode; 0: all that the process may use.
         network: Memory that the network needs beside them [bytes].
 
     Raises:
-        InputError: A dataset has no looks, one has damaged ones, they do not fit, or a task is none of the datasets'.
+        InputError: A dataset has no looks, one has damaged ones, they do not fit, a task is none of the datasets', or a
+            kind of change is unknown.
     """
+    kinds = [one.name for one in dataclasses.fields(Changes)]
+    for kind in changes:
+        if kind not in kinds:
+            raise InputError(f"--look-changes {kind}=: unknown, choose from {' '.join(kinds)}")
     for task in fractions:
         if task not in store.tasks:
             raise InputError(f"--looks {task}=: the datasets have {', '.join(store.tasks)}")
@@ -129,4 +141,5 @@ def load_looks(
         chances=torch.from_numpy(np.stack(chances)).to(device),
         objects=torch.from_numpy(np.stack(objects)).to(device),
         fractions=shares[store.task],
+        changes=Changes(**changes),
     )

@@ -96,8 +96,8 @@ def test_the_file_holds_the_fields_of_the_table(folder):
 
 
 def test_the_table_in_the_docs_is_the_one_of_the_code():
-    """docs/recording.md lists every field with type, shape and sentence."""
-    page = (ROOT / "docs" / "recording.md").read_text()
+    """docs/howto/train/recording.md lists every field with type, shape and sentence."""
+    page = (ROOT / "docs" / "howto" / "train" / "recording.md").read_text()
     assert fields_table() in page
 
 

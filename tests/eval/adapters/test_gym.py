@@ -402,10 +402,10 @@ def test_wrong_options_are_refused(options, message):
 
 
 def test_the_page_about_gymnasium(brief):
-    """Every Python block of docs/gym.md runs, one after the other, and gives what the page says."""
-    page = (Path(__file__).parents[3] / "docs" / "gym.md").read_text()
+    """Every Python block of docs/howto/program/gym.md runs, one after the other, and gives what the page says."""
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "program" / "gym.md").read_text()
     world = {"__name__": "docs_gym"}
     for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
-        exec(compile(block, "docs/gym.md", "exec"), world)
+        exec(compile(block, "docs/howto/program/gym.md", "exec"), world)
     assert world["action"].shape == (2, 40) and not world["info"]["startup"]
     assert (world["info"]["seed"], world["info"]["steps"]) == (21, 1)

@@ -136,8 +136,8 @@ CHEATS = [
 
 
 def test_the_page_lists_every_cheat():
-    """docs/certify.md has a row for each cheat, with the checks that find it."""
-    page = (Path(__file__).parents[3] / "docs" / "certify.md").read_text()
+    """docs/reference/certify.md has a row for each cheat, with the checks that find it."""
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "certify.md").read_text()
     table = page.split("`tests/eval/certification/test_certify_physical_cheats.py`")[1].split("\n\n")[1]
     rows = [re.findall(r"`([a-z]+)`", line) for line in table.splitlines()[2:]]
     found = {}

@@ -301,7 +301,7 @@ def test_readers_and_rules_agree_as_often_as_is_counted(tmp_path):
 def test_the_real_failures_are_at_hand():
     """The set that the check counts has 60 failures and more of a learned policy, several of each of five tasks."""
     kept, _ = read_journal(LABELLED / "episodes.jsonl")
-    strips = Path(__file__).parents[3] / "docs" / "failures_labelled"
+    strips = Path(__file__).parents[3] / "docs" / "results" / "failures_labelled"
     assert len(labelled_failures()) == len(kept) >= 60
     assert min(Counter(line.task for line in kept).values()) >= 6 and len({line.task for line in kept}) == 5
     assert {file.stem for file in strips.glob("*.webp")} == {f"{line.index:02d}" for line in kept}

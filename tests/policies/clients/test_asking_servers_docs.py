@@ -1,4 +1,4 @@
-"""Statements of docs/asking_servers.md hold: protocols, ports, keys and limits."""
+"""Statements of docs/howto/bring/asking_servers.md hold: protocols, ports, keys and limits."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ from arena_newton.policies.remote.vla_eval_client import VlaEvalPolicy
 from arena_newton.robot.canonical import ACTION, STATE
 
 ROOT = Path(__file__).parents[3]
-TEXT = (ROOT / "docs" / "asking_servers.md").read_text()
+TEXT = (ROOT / "docs" / "howto" / "bring" / "asking_servers.md").read_text()
 PLAIN = " ".join(TEXT.split())
 
 

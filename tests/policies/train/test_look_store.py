@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.policies.train.frames.augmentation import gathered_pictures
 from arena_newton.policies.train.frames.batching import BatchMaker
 from arena_newton.policies.train.frames.demonstration_rows import read_rows
 from arena_newton.policies.train.frames.frame_store import load_frames
@@ -97,6 +98,19 @@ def test_datasets_without_looks_are_refused(store, sets, dataset):
         load_looks([plain], store, 0.5, {})
     with pytest.raises(InputError, match="^--looks football=: the datasets have boxing, vis_navi"):
         load_looks(sets, store, 0.5, {"football": 0.1})
+
+
+def test_kinds_of_change_are_chosen(store, sets):
+    """Without any kind a changed sample is the picture itself; a kind that is not known is named."""
+    none = dict.fromkeys(("colours", "light", "things", "rectangles", "exposure"), 0.0)
+    looks = load_looks(sets, store, 1.0, {}, none)
+    assert looks.changes.patterns == 0.5 and looks.fractions.min() == 1.0
+    rows, plain = torch.arange(8), dataclasses.replace(store, looks=None)
+    rows, changed = looks.chosen(rows)
+    seen = gathered_pictures(dataclasses.replace(store, looks=looks), rows, changed=changed)
+    assert changed.any() and torch.allclose(seen, gathered_pictures(plain, rows), atol=1e-3)
+    with pytest.raises(InputError, match="^--look-changes lights=: unknown, choose from colours patterns"):
+        load_looks(sets, store, 1.0, {}, {"lights": 0.0})
 
 
 @pytest.mark.parametrize("given", ["1.5", "-0.1", "boxing", "boxing=2", "boxing=nan", ""])

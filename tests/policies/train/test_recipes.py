@@ -206,6 +206,16 @@ def test_flags_change_what_belongs_together(flags, expected):
     assert [found.realign, found.lr, found.lr_backbone] == pytest.approx(rates)
 
 
+def test_values_of_a_recipe_are_flags():
+    """--recipe-values changes fields that have no flag of their own, and those of the network, and no others."""
+    values = ("frozen_norms=0.5", "shift_px=0", "schedule=constant", "network.dim_model=128")
+    found, usual = chosen_recipe(PolicyTrainOptions(recipe="compact", recipe_values=values)), recipe("act", "compact")
+    assert (found.frozen_norms, found.shift_px, found.schedule) == (0.5, 0, "constant")
+    assert found.network == {**usual.network, "dim_model": 128}
+    same = {"frozen_norms": 0.3, "shift_px": usual.shift_px, "schedule": "cosine", "network": usual.network}
+    assert replace(found, **same) == usual
+
+
 @pytest.mark.parametrize(
     ("flags", "rates"),
     [
