@@ -1,4 +1,4 @@
-"""Success where it is a conjunction of conditions (`predicates`), with a margin that is differentiable as in `success`."""
+"""Success where it is a conjunction of conditions, with a margin that is differentiable as those in `success`."""
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 
