@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from arena_newton import policies, tasks, trackers
-from arena_newton.differentiable import Rolled, closed_loop, reset_state
+from arena_newton.differentiable import Rolled, closed_loop, reach, reset_state, soft_onset
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.timing import BenchFigure, Figures, chosen
@@ -21,6 +21,7 @@ from arena_newton.eval.certification.checks.gradients import TICK_STEPS, Slopes,
 from arena_newton.interfaces import Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from benchmarks.bench_options import GradientBenchOptions
@@ -45,6 +46,15 @@ LONGEST = 600
 """Ticks of an episode, at most."""
 TOUCHED = 0.1
 """Horizontal speed that tells a touch of what lies [m/s]."""
+LONGEST_KICK = 400
+"""Ticks within which the kick happens whose reach is measured."""
+BEHIND = 25
+"""Ticks from the kick to the ball's place that is differentiated."""
+SPED = 50
+"""Ticks before the touch in which the robot is sped up."""
+REACH_SCALES = (1e-3, 1e-2)
+"""Of the ball's start [m] and of the speed [m/s]."""
+MOVED = ("its start x", "its start y", "the kick's speed")
 REPLAY_BAR = 1e-4
 """Largest distance of a loop from the episode that it replays [m, rad]."""
 FACTORS = ("friction", "mass", "mass:/World/Robot/torso_link", "kp", "kd")
@@ -65,6 +75,7 @@ def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
             for ticks, bar, factors in _lengths(task)
         ),
         "replay": lambda: (_replay(task, tracker) for tracker in options.trackers for task in options.loops),
+        "reach": reach_figures,
         "featherstone": featherstone_figures,
     }
     for figures in chosen(options.what, items).values():
@@ -77,6 +88,11 @@ def _lengths(task: str) -> Iterator[tuple[int | None, float, Sequence[str]]]:
     if task in KICKS:
         yield None, 1e-2, ()
     yield FACTOR_TICKS, 1e-2, FACTORS
+
+
+def _world(task: str, tracker: str) -> ArenaEnv:
+    follows = trackers.get(tracker)
+    return ArenaEnv(task, tracker=follows, worlds=1, engine="mujoco", rules="released", fast_physics=True)
 
 
 def _tick(task: str, tracker: str, states: int) -> BenchFigure:
@@ -105,7 +121,7 @@ def _apart(slopes: Slopes) -> float:
 
 def _loop(task: str, tracker: str, ticks: int | None, bar: float, factors: Sequence[str] = ()) -> BenchFigure:
     """Largest relative error of slopes of the pelvis' last position to actions, start and speeds, or to factors."""
-    env = ArenaEnv(task, tracker=trackers.get(tracker), worlds=1, engine="mujoco", rules="released", fast_physics=True)
+    env = _world(task, tracker)
     for model in env.physics.models:
         model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 100
     robot, seeds = env.scene.robot, [seeding.episode_seed(tasks.get(task).gym_id, 0, 0)]
@@ -173,7 +189,7 @@ class _Path(Recorder):
 
 def _replay(task: str, tracker: str) -> BenchFigure:
     """Largest distance of a closed loop from the expert's whole episode, whose actions it repeats."""
-    env = ArenaEnv(task, tracker=trackers.get(tracker), worlds=1, engine="mujoco", rules="released", fast_physics=True)
+    env = _world(task, tracker)
     seed, path = seeding.episode_seed(tasks.get(task).gym_id, 0, 0), _Path()
     episodes = [SimpleNamespace(episode_seed=seed)]
     Rollout(env, policies.get("expert"), episodes, recorder=path, max_steps=LONGEST).run()
@@ -188,3 +204,43 @@ def _replay(task: str, tracker: str) -> BenchFigure:
     env.close()
     name = f"distance from the replayed episode, {task} through {tracker}"
     return BenchFigure(name, REPLAY_BAR, "m, rad", True, float(apart.max()), note)
+
+
+def reach_figures() -> Iterator[BenchFigure]:
+    """Slopes of the ball's path behind a kick to where it starts and to the speed of the kick, beside differences.
+
+    With contacts as they are, and with those of `soft_onset`; of these all three are to hold.
+    """
+    for soft in (False, True):
+        env = _world("football", "twist2")
+        seeds = [seeding.episode_seed(env.spec.gym_id, 0, 0)]
+        with torch.no_grad():
+            rolled = closed_loop(env, policies.get("expert"), seeds, LONGEST_KICK)
+        touch = touch_of(env, rolled)
+        actions = rolled.actions[: touch + BEHIND].transpose(0, 1)
+        if soft:
+            soft_onset(env, env.spec.target)
+        yield _reach(env, seeds, actions, touch, soft)
+        env.close()
+
+
+def _reach(env: ArenaEnv, seeds: Sequence[int], actions: torch.Tensor, touch: int, soft: bool) -> BenchFigure:
+    """Number of the slopes that hold."""
+    start, ball = reset_state(env, seeds), env.scene.joint_qpos(env.spec.target)
+    faster = torch.zeros_like(actions)
+    faster[:, touch - SPED : touch, 0] = TICK
+
+    def end(points: torch.Tensor) -> torch.Tensor:
+        qpos = start.qpos.index_add(1, torch.tensor([ball, ball + 1]), points[:, :2])
+        plan, moved = actions + points[0, 2] * faster, start._replace(qpos=qpos)
+        rolled = closed_loop(env, plan, seeds, plan.shape[1], start=moved, checkpoint=25)
+        return rolled.qpos[-1, :, ball + 1]
+
+    at = torch.zeros(3, dtype=torch.float64)
+    leaf = at.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(end(leaf[None])[0], leaf)
+    found = reach(end, at, slope, REACH_SCALES, rows=1)
+    rows = zip(MOVED, *(part.tolist() for part in found), strict=True)
+    note = "; ".join(f"{name} {exact:+.2f} ({near:+.2f}, {far:+.2f})" for name, exact, near, far, _ in rows)
+    name = f"slopes through a kick that hold over 1 cm, {'soft onset' if soft else 'contacts as they are'}"
+    return BenchFigure(name, 3.0 if soft else None, "of 3", False, float(found.holds.sum()), note)
