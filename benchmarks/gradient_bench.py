@@ -53,7 +53,7 @@ BEHIND = 25
 SPED = 50
 """Ticks before the touch in which the robot is sped up."""
 REACH_SCALES = (1e-3, 1e-2)
-"""Of the ball's start [m] and of the speed [m/s]."""
+"""Scales of the ball's start [m] and of the speed [m/s]."""
 MOVED = ("its start x", "its start y", "the kick's speed")
 REPLAY_BAR = 1e-4
 """Largest distance of a loop from the episode that it replays [m, rad]."""
@@ -64,7 +64,7 @@ STEP = 1e-6
 
 
 def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
-    """What `--what` names, by tracker and task; differences are those of a converged solver."""
+    """Figures that `--what` names, by tracker and task; differences are those of a converged solver."""
     every = options.tasks or tasks.names()
     items: dict[str, Figures] = {
         "ticks": lambda: (_tick(task, tracker, options.states) for tracker in options.trackers for task in every),
