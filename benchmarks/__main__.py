@@ -19,6 +19,7 @@ from benchmarks.bench_options import (
     DatasetBenchOptions,
     ForgeryOptions,
     GradientBenchOptions,
+    HonestOptions,
     PeerOptions,
     PlainBenchOptions,
     PolicyBenchOptions,
@@ -64,7 +65,8 @@ BENCHES = {
     "episodes": Item(PlainBenchOptions, "single_figures:episode_times", "60 Football episodes on two cores"),
     "gradients": Item(GradientBenchOptions, "gradient_bench:slope_figures", "exact slopes against finite differences"),
     "overview": Item(PlainBenchOptions, "single_figures:overview_times", "python -m arena_newton.eval --help"),
-    "forgeries": Item(ForgeryOptions, "forgeries:forgery_figures", "forged results, and what finds each"),
+    "forgeries": Item(ForgeryOptions, "audits.forgeries:forgery_figures", "forged results, and what finds each"),
+    "honest": Item(HonestOptions, "audits.honest_folders:honest_figures", "honest results that an audit accuses: none"),
     "tests": Item(PlainBenchOptions, "single_figures:suite_times", "the test suite, kernels cached and not"),
 }
 """Benches by name."""

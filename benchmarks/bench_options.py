@@ -13,6 +13,7 @@ __all__ = [
     "DatasetBenchOptions",
     "ForgeryOptions",
     "GradientBenchOptions",
+    "HonestOptions",
     "PeerOptions",
     "PlainBenchOptions",
     "PolicyBenchOptions",
@@ -178,12 +179,24 @@ class PeerOptions(PlainBenchOptions):
 
 @dataclass(frozen=True)
 class ForgeryOptions(PlainBenchOptions):
-    """Forge a results folder in fifty ways, and say at which level `eval audit` finds each."""
+    """Forge a results folder in some seventy ways, and say at which level `eval audit` finds each."""
 
     folder: str = ""
     """Honest folder of a run on engine mujoco; copies are forged."""
     policy: str | None = None
     """Policy of the folder, to be asked again."""
+
+
+@dataclass(frozen=True)
+class HonestOptions(PlainBenchOptions):
+    """Play honest folders of many kinds, each a run of its own, and count those that an audit accuses."""
+
+    count: int = field(default=500, metadata=bounds(1, 100_000))
+    """Folders."""
+    replay_every: int = field(default=3, metadata=bounds(1, 100_000))
+    """Of every so many folders two episodes are played again too."""
+    seed: int = 0
+    """Number by which kinds and flags are drawn."""
 
 
 @dataclass(frozen=True)
