@@ -25,18 +25,17 @@ ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PARTS = {"start": "Start", "concepts": "Concepts", "howto": "How-to", "reference": "Reference", "results": "Results"}
 """Folder of pages → title of a part of the site."""
-SECTIONS = {"evaluate": "Evaluate", "bring": "Bring your own", "train": "Record and train", "program": "Program"}
-"""Folder within a part → title of a group of its pages."""
 BESIDE = {
     "start": ["docs/index"],
     "concepts": ["docs/glossary"],
-    "howto": ["examples/index"],
+    "howto": ["docs/examples"],
     "reference": ["api/index", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
     "results": ["policies/weights/learned/card", "eval/tables/paper/README"],
 }
 """Pages of a part that are made here or lie elsewhere; they come last."""
-INDEX = (ROOT / "docs" / "index.md").read_text()
-EXAMPLES = re.findall(r"^\| \[`(\w+)\.py`\]", INDEX.split("## Examples\n")[1], flags=re.MULTILINE)
+INDEX = {part.partition("\n")[0]: part for part in (ROOT / "docs" / "index.md").read_text().split("\n## ")[1:]}
+"""Title of a part → its section of the index."""
+EXAMPLES = re.findall(r"^\| \[`(\w+)\.py`\]", INDEX["Examples"], flags=re.MULTILINE)
 CONFIGURATION = {
     "project": PROJECT["name"],
     "copyright": "The arena_newton contributors, Apache-2.0",
@@ -46,6 +45,7 @@ CONFIGURATION = {
     "smartquotes": False,
     "html_theme": "pydata_sphinx_theme",
     "html_title": "arena_newton",
+    "html_context": {"default_mode": "auto"},
     "html_theme_options": {
         "show_prev_next": True,
         "navigation_with_keys": False,
@@ -82,7 +82,7 @@ def page_links(text: str, page: Path, folder: Path) -> str:
         if (ROOT / file).is_dir():
             if file.name != "examples":
                 return shown
-            file = file / "index.md"
+            file = Path("docs/examples.md")
         elif file == Path("README.md"):
             file = Path("index.md")
         elif file.parent == Path("examples") and file.stem in EXAMPLES:
@@ -96,15 +96,15 @@ def page_links(text: str, page: Path, folder: Path) -> str:
 
 
 def reading(part: str) -> dict[str, list[str]]:
-    """Title of a group of pages → its pages, in the order in which the index names them.
+    """Title of a group of pages → its pages, in the order in which their section of the index names them.
 
-    A page that the index does not name is in no part, which is a warning of Sphinx.
+    A page that the section does not name is in no part, which is a warning of Sphinx.
     """
     groups: dict[str, list[str]] = {}
-    for page in dict.fromkeys(re.findall(rf"\]\(({part}/[\w/]+)\.md", INDEX)):
-        groups.setdefault(SECTIONS.get(page.split("/")[1], ""), []).append(f"docs/{page}")
-    groups.setdefault("", []).extend(BESIDE[part])
-    return groups
+    for group in INDEX[PARTS[part]].split("\n### "):
+        pages = dict.fromkeys(re.findall(rf"\]\({part}/([\w/]+)\.md", group))
+        groups[group.partition("\n")[0]] = [f"{part}/{page}" for page in pages]
+    return groups | {"More": [os.path.relpath(page, "docs") for page in BESIDE[part]]}
 
 
 def table_of_contents(pages: Iterable[str], hidden: bool = False, caption: str = "") -> str:
@@ -130,20 +130,21 @@ def collect(folder: Path) -> None:
         name = path.relative_to(ROOT)
         text = page_links((ROOT / name).read_text(), name, folder)
         if name.name == "README.md" and name.parent == Path():
-            text += table_of_contents(PARTS, hidden=True)
+            text += table_of_contents([f"docs/{part}" for part in PARTS], True)
             name = Path("index.md")
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    for part, title in PARTS.items():
-        lists = [table_of_contents(pages, caption=group) for group, pages in reading(part).items()]
-        (folder / f"{part}.md").write_text("\n".join([f"# {title}", *lists]))
+    for title, section in INDEX.items():
+        name = Path("docs") / f"{title.lower().replace('-', '')}.md"
+        lists = reading(name.stem) if name.stem in PARTS else {"": [f"../examples/{example}" for example in EXAMPLES]}
+        text = page_links(f"# {section}\n".replace("\n### ", "\n## "), name, folder)
+        text += "".join(table_of_contents(pages, True, group) for group, pages in lists.items() if pages)
+        (folder / name).write_text(text)
     words = (ROOT / "CONTRIBUTING.md").read_text().split("## Glossary\n")[1].split("\n## ")[0]
     (folder / "docs" / "glossary.md").write_text(f"# Glossary\n{words}")
     (folder / "examples").mkdir(exist_ok=True)
     for example in EXAMPLES:
         (folder / "examples" / f"{example}.md").write_text(example_page(example))
-    first = "# Examples\n\nShort programs, in the order of reading.\n"
-    (folder / "examples" / "index.md").write_text(first + table_of_contents(EXAMPLES))
     (folder / "api").mkdir()
     for module, text in api_reference.pages().items():
         (folder / "api" / f"{module}.md").write_text(text)
@@ -156,7 +157,8 @@ def llms(folder: Path) -> str:
     lines = [f"# {PROJECT['name']}", "", f"> {PROJECT['description']}"]
     for part, title in PARTS.items():
         lines += ["", f"## {title}", ""]
-        for page in itertools.chain.from_iterable(reading(part).values()):
+        for name in itertools.chain.from_iterable(reading(part).values()):
+            page = os.path.normpath(f"docs/{name}")
             title = (folder / f"{page}.md").read_text().splitlines()[0].removeprefix("# ")
             lines.append(f"- [{title}]({page}.html)")
     return "\n".join(lines) + "\n"

@@ -55,7 +55,7 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.release
 def test_the_site(tmp_path):
-    """The site builds without a warning, and has every page, the glossary's rows, the examples and the public names."""
+    """The site builds without a warning or a dead link, with every page, glossary, examples and public names."""
     pytest.importorskip("sphinx", reason="needs the extra [docs]: sphinx is not installed")
     command = [sys.executable, str(ROOT / "docs" / "build.py"), "--out", str(tmp_path)]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -63,6 +63,10 @@ def test_the_site(tmp_path):
     listed = (tmp_path / "llms.txt").read_text()
     pages = [page.relative_to(ROOT).with_suffix(".html") for page in DOCS]
     assert all(f"({page})" in listed and (tmp_path / page).is_file() for page in pages)
+
+    for page in set(tmp_path.rglob("*.html")) - set(tmp_path.glob("_static/*")):
+        for target in re.findall(r'(?:href|src)="([^"#?]+)', page.read_text()):
+            assert ":" in target or (page.parent / target).exists(), f"{page}: {target}"
 
     def text(page: str) -> str:
         return html.unescape(re.sub(r"<[^>]+>", "", (tmp_path / page).read_text()))
@@ -72,7 +76,7 @@ def test_the_site(tmp_path):
     assert len(rows) > 30 and [cell for cell in cells if cell not in text("docs/glossary.html")] == []
     examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
     assert all(f"python examples/{name}.py" in text(f"examples/{name}.html") for name in examples)
-    assert {path.stem for path in (tmp_path / "examples").glob("*.html")} == examples | {"index"}
+    assert {path.stem for path in (tmp_path / "examples").glob("*.html")} == examples
     public = (tmp_path / "api" / "arena_newton.html").read_text()
     assert all(f'id="arena_newton.{name}"' in public for name in ("ArenaEnv", "ArenaEnv.step", "Rollout.run"))
 

@@ -1,7 +1,9 @@
 """The package imports the same from a checkout and from a wheel, and shadows nobody."""
 
 import logging
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -99,20 +101,16 @@ def test_the_package_says_what_it_is():
     assert project["scripts"] == {"arena-newton": "arena_newton.__main__:main"}
 
 
-def test_the_container_is_pinned_and_has_no_root():
-    """The Dockerfile has known instructions, pins what it installs as the project does, and ends as a plain user."""
-    text = re.sub(r"^#.*\n", "", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE)
-    steps = [line.split(maxsplit=1) for line in text.replace("\\\n", " ").splitlines() if line]
-    assert {name for name, _ in steps} <= {"FROM", "RUN", "COPY", "USER", "WORKDIR", "ENTRYPOINT", "CMD"}
-    bases = [given.split()[0] for name, given in steps if name == "FROM"]
-    assert all(re.fullmatch(r"python:3\.12\.\d+-slim-\w+", base) for base in bases)
+def test_the_container_is_linted_and_pinned():
+    """A linter finds nothing in the Dockerfile (untagged base, last user root), which installs the versions tested."""
+    linter = shutil.which("hadolint", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    if linter is None:
+        pytest.skip("needs the group dev: hadolint is not installed")
+    found = subprocess.run([linter, "--no-color", ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    installed = re.findall(r"\S+==\S+", (ROOT / "Dockerfile").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    tested = set(project["tool"]["uv"]["constraint-dependencies"])
-    installed = [word for name, given in steps if name == "RUN" for word in given.split() if "==" in word]
-    assert len(installed) == 3 and set(installed) <= tested
-    last = [name for name, _ in steps]
-    assert last.index("USER") > max(number for number, name in enumerate(last) if name == "RUN")
-    assert ["ENTRYPOINT", '["arena-newton"]'] in steps and "arena-newton" in project["project"]["scripts"]
+    assert len(installed) == 3 and set(installed) <= set(project["tool"]["uv"]["constraint-dependencies"])
 
 
 def test_a_missing_torchcodec_is_no_page_of_tracebacks():
