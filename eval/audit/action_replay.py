@@ -55,6 +55,7 @@ DECIDED = ("outcome", "reason")
 DRIFT = 4.0
 """Tolerances of a tick that the differences of a second may add up to."""
 UNITS = {"positions": "m", "velocities": "m/s or rad/s"}
+MEASURED = ("position", "velocity", "position over a second", "velocity over a second")
 LATE = 2
 """Ticks by which such an episode may end earlier or later: a force or margin near its bar."""
 FORGED = (0.01, 0.05, 0.1, 0.25)
@@ -130,6 +131,8 @@ def replay(
         tolerances = tick_tolerance, velocity_tolerance
         _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tolerances=tolerances)
     audit.replayed = len(records)
+    audit.largest |= {"answer": totals.largest} if policy is not None else {}
+    audit.largest |= dict(zip(MEASURED, totals.furthest, strict=True)) if by_tick else {}
     odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
     sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")

@@ -64,6 +64,9 @@ class Audit:
     """Episodes at whose queries the policy was asked again."""
     fresh: int | None = None
     """Episodes on seeds of the auditor."""
+    largest: dict[str, float] = field(default_factory=dict)
+    """Largest differences that were measured, by name: `answer` of a policy; `position` [m] and `velocity` [m/s, rad/s]
+    after a tick of another engine, and of both the sum over a second."""
 
     @property
     def level(self) -> str:
@@ -94,6 +97,7 @@ class Audit:
             "contradictions": self.faults,
             "notes": self.notes,
             "replayed": self.replayed,
+            "largest differences": self.largest,
         }
 
 
