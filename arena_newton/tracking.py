@@ -223,11 +223,7 @@ class TrackerLoop:
         """Robot as its latency lets the tracker see it."""
         if self._late is None:
             return self.state
-        parts = self.state.tensors()
-        now = torch.cat([*parts.values()], 1)
-        late = self._late[0].late(now).split([part.shape[1] for part in parts.values()], 1)
-        self._late[0].keep(now, mask)
-        return RobotState(**dict(zip(parts, late, strict=True)))
+        return RobotState(**self._late[0].late_parts(self.state.tensors(), mask))
 
     def announce(self, coming: torch.Tensor) -> None:
         """Take the actions that follow the next tick's, for a tracker with a lookahead; they count for that tick alone.

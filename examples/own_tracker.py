@@ -1,7 +1,6 @@
 """A tracker of your own: TWIST2 with smoothed joint targets.
 
-Shows: a tracker's methods, a memory that obeys masks, the conformance checks, a first test.
-More: docs/howto/bring/trackers.md.
+Shows: a tracker's methods, a memory that obeys masks, the conformance checks. More: docs/howto/bring/trackers.md.
 
     python examples/own_tracker.py
 """

@@ -1,16 +1,14 @@
 """Any program as a policy: it reads a line of JSON for each query and writes one, and may be in any language.
 
-Shows: the protocol of `--policy process:<command>`, whose answers repeat the number of their request. Called with the
-word `answer` this file is such a program: it squats and rises. Without it, it plays itself in two worlds.
+Shows: the protocol of `--policy process:<command>`, whose answers repeat the number of their request. This program
+squats and rises, and imports nothing of the package; nothing need be installed but what it runs in.
 
-    python examples/process_policy.py --out process_policy
+    python -m arena_newton.eval --task boxing --policy "process:python examples/process_policy.py" --seeds 0 --repeats 2
 """
 
 import json
 import math
 import sys
-
-from arena_newton.eval.__main__ import main as evaluate
 
 LEGS = (-0.2, -0.2, *[0.0] * 7, 0.4, 0.4, 0.0, 0.0, -0.2, -0.2)  # hips ... knees ... ankles, left and right [rad]
 STAND = (*LEGS, 0.4, -0.4, *[0.0] * 4, 1.2, 1.2, *[0.0] * 6)  # 29 joints in canonical order
@@ -32,10 +30,6 @@ def answer(asked: dict) -> dict:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["answer"]:
-        for line in sys.stdin:
-            asked = json.loads(line)
-            print(json.dumps(answer(asked) | {"id": asked["id"]}), flush=True)
-    else:
-        flags = f"--task boxing --tracker twist2 --seeds 0 --repeats 2 --engine mujoco {' '.join(sys.argv[1:])}"
-        evaluate([*flags.split(), "--policy", f"process:{sys.executable} {__file__} answer"])
+    for line in sys.stdin:
+        asked = json.loads(line)
+        print(json.dumps(answer(asked) | {"id": asked["id"]}), flush=True)

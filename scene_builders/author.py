@@ -52,7 +52,8 @@ def look_at(eye: Vec, point: Vec) -> tuple[float, float, float, float]:
     x = np.cross((0.0, 0.0, 1.0), z)
     x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
     quat = Gf.Matrix3d(*map(float, np.concatenate([x, np.cross(z, x), z]))).ExtractRotation().GetQuat()
-    return (quat.GetReal(), *quat.GetImaginary())
+    real, i, j, k = (round(value, 12) for value in (quat.GetReal(), *quat.GetImaginary()))  # processors differ beyond
+    return real, i, j, k
 
 
 def attribute(prim: Usd.Prim, name: str, value: object, kind: Sdf.ValueTypeName) -> Usd.Attribute:

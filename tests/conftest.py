@@ -141,19 +141,24 @@ def install(package: Path, folder: Path) -> Path:
 
 
 @pytest.fixture
-def installed_falcon(tmp_path, monkeypatch):
-    """The example package of a tracker as an installer leaves it: importable, with its entry points."""
-    monkeypatch.syspath_prepend(install(ROOT / "tests" / "trackers" / "falcon_package", tmp_path))
-    yield
-    sys.modules.pop("falcon_tracker", None)
+def installed(tmp_path, monkeypatch):
+    """Leaves a package, named by its folder, as an installer does: importable, with its entry points, for one test."""
+    yield lambda package: monkeypatch.syspath_prepend(install(package, tmp_path / "installed" / package.name))
+    for name, module in [*sys.modules.items()]:
+        if (getattr(module, "__file__", None) or "").startswith(str(tmp_path / "installed")):
+            del sys.modules[name]
 
 
 @pytest.fixture
-def installed_homing(tmp_path, monkeypatch):
-    """The example package of a tracker with state estimation and a window, as an installer leaves it."""
-    monkeypatch.syspath_prepend(install(ROOT / "examples" / "new_tracker", tmp_path))
-    yield
-    sys.modules.pop("homing_tracker", None)
+def installed_falcon(installed):
+    """The example package of a tracker."""
+    installed(ROOT / "tests" / "trackers" / "falcon_package")
+
+
+@pytest.fixture
+def installed_homing(installed):
+    """The example package of a tracker with state estimation and a window."""
+    installed(ROOT / "examples" / "new_tracker")
 
 
 @pytest.fixture(scope="session")

@@ -36,7 +36,7 @@ INNER = {
     f"{PACKAGE}.eval.certification": """certify_options stand_ins | context | finding | claims | checks
         | certificate jobs | certify""",
     PACKAGE: """errors | files | cli pages | robot | interfaces rules | kernel_cache tasks | physics | rule_sets
-        | pictures | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
+        | pictures recorders | tracking | env | rollout | data | differentiable testing | doctor | __main__""",
     f"{PACKAGE}.data": "readers | recording | datasets | checks | __main__",
     f"{PACKAGE}.policies": """chunk_flags recipes | base | label_reader open_loop stand serve_example | protocols
         | replay_dataset | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import importlib.util
+import json
 import re
 import runpy
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from arena_newton.cli.extras import EXTRAS
+from arena_newton.eval.__main__ import main
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -25,11 +27,9 @@ SHORT: dict[str, list[str]] = {
     "drive_by_code": ["--max-steps", "55"],
     "fit_motion": ["--iterations", "2", "--plays", "2", "--max-steps", "6"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
-    "own_metric": [*RUN, "--policy", "stand"],
-    "own_mode": ["--max-steps", "4"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
-    "process_policy": ["--max-steps", "15", "--out", "OUT"],
+    "process_policy": RUN,
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "refine_reference": ["--max-steps", "4", "--rounds", "2"],
     "research": [*RUN, "--policy", "stand"],
@@ -45,11 +45,9 @@ SAYS = {
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
     "fit_motion": r"(gradient  misfit 0\.\d+ .* s\n){2}(CEM       misfit \d\.\d+ .* s\n)+",
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
-    "own_metric": r"boxing \| twist2  \| stand  \| base \| highest_speed \| 1 \| 0\.\d+ ± 0 \| 0\.\d+ to 0\.\d+ \|\n",
-    "own_mode": r"(football/wet/s0/r\d: timeout after 0.1 s\n){2}",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
-    "process_policy": r"policy process:python process_policy.py answer, (.*\n)*2 episodes, this run took",
+    "process_policy": r"policy process:python process_policy.py, (.*\n)*1 episode, this run took",
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
@@ -59,6 +57,10 @@ SAYS = {
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
 """Example → what its output holds."""
+PROGRAMS = ("process_policy",)
+"""Examples that a run calls as its policy."""
+BARS = {"new_metric": 30, "new_mode": 40, "new_policy": 50, "new_task": 250, "new_tracker": 75}
+"""Example that is a package → most lines of its code; each is installed and played below or next to what it extends."""
 
 
 def test_every_example_is_run():
@@ -95,9 +97,41 @@ def test_example_runs(path, tmp_path, monkeypatch, capsys):
     flags = [str(tmp_path / "out") if flag == "OUT" else flag for flag in SHORT[path.stem]]
     monkeypatch.setattr(sys, "argv", [str(path), *flags])
     monkeypatch.chdir(tmp_path)
-    with contextlib.suppress(SystemExit):
-        runpy.run_path(str(path), run_name="__main__")
+    if path.stem in PROGRAMS:
+        main([*flags, "--policy", f"process:{sys.executable} {path}"])
+    else:
+        with contextlib.suppress(SystemExit):
+            runpy.run_path(str(path), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(SAYS[path.stem], printed), printed
     if "OUT" in SHORT[path.stem]:
         assert any((tmp_path / "out").rglob("*.*"))
+
+
+def test_packages_say_what_they_show():
+    """Each example that is a package is short, and says in its code how it is installed, or its page does."""
+    folders = sorted(file.parent for file in (ROOT / "examples").glob("*/pyproject.toml"))
+    assert [folder.name for folder in folders] == sorted(BARS)
+    page = (ROOT / "docs" / "howto" / "bring" / "add_a_task.md").read_text(encoding="utf-8")
+    for folder in folders:
+        texts = [file.read_text(encoding="utf-8") for file in folder.rglob("*.py")]
+        assert sum(text.count("\n") for text in texts) <= BARS[folder.name]
+        assert f"uv pip install -e examples/{folder.name}\n" in "".join([*texts, page])
+
+
+def test_packages_of_a_mode_a_metric_and_a_policy_play(installed, tmp_path, capsys):
+    """Installed, they are known by name: one run has all three, goes on, and is played again with its metric."""
+    for name in ("new_metric", "new_mode", "new_policy"):
+        installed(ROOT / "examples" / name)
+    out = tmp_path / "out"
+    names = "--mode base wet --recorder speed --policy wary".split()
+    assert main([str(out) if flag == "OUT" else flag for flag in RUN] + names) == 0
+    assert re.search(r"boxing \| twist2  \| wary   \| wet  \| highest_speed \| 1 \| 0\.\d+ ", capsys.readouterr().out)
+    config = json.loads((out / "config.json").read_text())["config"]
+    assert list(config["mode_facts"]) == ["wet"] and config["policy_facts"]["code"]
+    assert main(["resume", str(out)]) == 0
+    assert main(["audit", str(out), "--replay", "2"]) == 0
+    lines = (out / "episodes.jsonl").read_text()
+    assert lines.count('"highest_speed"') == 2
+    assert main([*RUN, "--policy", "stand", "--recorder", "pace"]) == 2
+    assert "error: --recorder pace: unknown recorder; known are speed" in capsys.readouterr().err

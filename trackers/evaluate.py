@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Entry", "main"]
 
 PROG = program("trackers evaluate", "arena_newton.trackers.evaluate")
-ROLLOUTS = {"full": 64, "quick": 8}
+ROLLOUTS = {"full": 64, "quick": 8, "push": 16}
 """Rollouts per cell, unless --rollouts says otherwise."""
 
 
@@ -89,17 +89,22 @@ def _parser() -> argparse.ArgumentParser:
     add("--tracker", dest="trackers", action=_AddTracker, metavar="NAME", help=name)
     add("--checkpoint", action=_OfLastTracker, metavar="PATH", help="weights of the --tracker before it")
     add("--label", action=_OfLastTracker, metavar="TEXT", help="what tables call the --tracker before it")
-    add("--suite", choices=tuple(ROLLOUTS), default="full", help="full: every cell; quick: a few")
+    add(
+        "--suite",
+        choices=tuple(ROLLOUTS),
+        default="full",
+        help="full: every cell; quick: a few; push: blows on a tour of 60 s",
+    )
     add("--only", nargs="+", default=[], metavar="CELL", help="only cells or groups whose names contain one of these")
     add("--clips", nargs="+", default=[], type=Path, metavar="FILE", help="motion clips or libraries to add")
-    add("--rollouts", type=int, default=None, metavar="N", help="rollouts per cell (64 full, 8 quick)")
+    add("--rollouts", type=int, default=None, metavar="N", help="rollouts per cell (64 full, 8 quick, 16 push)")
     add("--goals", type=int, default=None, metavar="N", help="goals in closed loop (20 full, 4 quick)")
     add("--seed", type=int, default=0, help="seed of goals and start perturbations")
     add("--engine", choices=("auto", "mujoco", "warp"), default="auto", help="physics engine")
     add("--device", default=None, help="cpu, cuda or cuda:N")
     add("--threads", type=int, default=None, metavar="N", help="CPU threads of engine mujoco")
     add("--fast-physics", action="store_true", help="each tracker's fast physics rate")
-    add("--film", action="store_true", help="write film strips of a walk, a kick, a squat and a sit")
+    add("--film", action="store_true", help="write film strips: a walk, a kick, a squat and a sit; blows")
     add("--no-bench", dest="bench", action="store_false", help="leave out the inference times")
     add("--list", dest="show", action="store_true", help="print the cells and stop")
     add("--out", type=Path, default=None, metavar="DIR", help="write evaluation.{md,json,csv,png} and films here")
@@ -151,9 +156,10 @@ def _evaluate(args: argparse.Namespace) -> int:
         entry.make()  # refuses unfit files before anything is built
 
     from arena_newton.physics.engines import resolve_engine
-    from arena_newton.trackers.evaluation import chart, tracker_report
+    from arena_newton.trackers.evaluation import chart, push_suite, tracker_report
     from arena_newton.trackers.evaluation.figures import Result
     from arena_newton.trackers.evaluation.inference_times import inference
+    from arena_newton.trackers.evaluation.parts import play_parts
     from arena_newton.trackers.evaluation.suite_rollout import make_plan, play
     from arena_newton.trackers.evaluation.tracker_film import film
 
@@ -169,7 +175,11 @@ def _evaluate(args: argparse.Namespace) -> int:
     for entry in args.trackers:
         print(f"{entry.label}: {len(played.cells)} cells, {len(played.cell)} rollouts", file=sys.stderr, flush=True)
         tracker = entry.make()
-        outcome = play(tracker, played, **options)
+        if args.suite == "push":
+            outcome = play_parts(entry.make, entry.label, played, args.out, **options)
+            push_suite.add_blow_measures(outcome, played)
+        else:
+            outcome = play(tracker, played, **options)
         times = inference(entry.make) if args.bench else {}
         facts = tracker.describe() | {"drive": tracker.drive.name}
         result = Result(entry.label, tracker.name, entry.official, facts, played, outcome, inference=times)
@@ -193,7 +203,9 @@ def _evaluate(args: argparse.Namespace) -> int:
         print(f"{picture}: {chart.missing()}" if chart.missing() else chart.chart(results, picture), file=sys.stderr)
         if args.film:
             for entry in args.trackers:
-                for path in film(entry.make(), entry.label, args.out, seed=args.seed, **options):
+                for path in film(
+                    entry.make(), entry.label, args.out, blows=args.suite == "push", seed=args.seed, **options
+                ):
                     print(path, file=sys.stderr)
     return 0
 

@@ -313,6 +313,8 @@ class GradedTracker(Tracker):
     """Ticks of a network's tracker that autograd records: its own front end and network, in float64 on the CPU.
 
     The buffers of the front end are those of one graph; `resumed` continues with others, from what `memory` gives.
+    Tensors that are attributes of the front end itself, and not of an object within it, are copied; memory kept
+    elsewhere is shared with the tracker that it came from.
     """
 
     def __init__(self, front_end: FrontEnd, network: torch.nn.Module, worlds: int):

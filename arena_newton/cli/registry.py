@@ -24,7 +24,9 @@ def _installed(group: str, path: tuple[str, ...]) -> importlib.metadata.EntryPoi
 class Registry[T]:
     """Makers of one kind of thing, or things themselves; the built-in ones are imported when they are asked for."""
 
-    def __init__(self, noun: str, group: str, base: Callable[[], type[T]], built_in: Mapping[str, str]):
+    def __init__(
+        self, noun: str, group: str, base: Callable[[], type[T]], built_in: Mapping[str, str], *, named: bool = False
+    ):
         """Name the kind.
 
         Args:
@@ -32,8 +34,9 @@ class Registry[T]:
             group: Entry-point group under which other packages offer theirs.
             base: Gives the class that everything made must be of.
             built_in: Name to `module:attribute` of a maker.
+            named: Whether what is made has a `name`, which must be the one it is known by.
         """
-        self.noun, self.group, self.base, self.built_in = noun, group, base, built_in
+        self.noun, self.group, self.base, self.built_in, self.named = noun, group, base, built_in, named
         self._registered: dict[str, Callable[..., T] | T] = {}
 
     def register(self, name: str, factory: Callable[..., T] | T) -> None:
@@ -79,12 +82,13 @@ class Registry[T]:
         """Make one by name.
 
         Raises:
-            InputError: Unknown or doubled name, a package that does not load, or a maker that does not fit.
+            InputError: Unknown or doubled name, a package that does not load, a maker that does not fit, or another
+                name than that of what it makes, where they are `named`.
         """
         self.check(name)
         factory = self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
         if isinstance(factory, self.base()):
-            return factory
+            return self._known_as(name, factory)
         if not callable(factory):
             raise InputError(f"--{self.noun} {name}: its package offers a {type(factory).__name__}, not a {self.noun}")
         try:
@@ -97,6 +101,12 @@ class Registry[T]:
         if not isinstance(made, self.base()):
             kind = self.base().__name__
             raise InputError(f"--{self.noun} {name}: its factory makes a {type(made).__name__}, not a {kind}")
+        return self._known_as(name, made)
+
+    def _known_as(self, name: str, made: T) -> T:
+        own = getattr(made, "name", name) if self.named else name
+        if own != name:
+            raise InputError(f"--{self.noun} {name}: its package calls it {own}; entry point and record need one name")
         return made
 
     def _own(self, name: str) -> Callable[..., T] | T:

@@ -63,6 +63,13 @@ class Delay:
         return self._since(now)[self.ticks, self._rows]
 
     def keep(self, now: torch.Tensor, mask: torch.Tensor) -> None:
-        """Remember the rows of a tick of the masked worlds."""
-        self._past = torch.where(mask[:, None], self._since(now)[:-1], self._past)
+        """Remember the rows of a tick of the masked worlds; every buffer keeps its address."""
+        self._past.copy_(torch.where(mask[:, None], self._since(now)[:-1], self._past))
         self._empty &= ~mask
+
+    def late_parts(self, parts: Mapping[str, torch.Tensor], mask: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The delayed rows of tensors side by side, by name, of which these are the newest; `keep` of some worlds."""
+        now = torch.cat([*parts.values()], 1)
+        late = self.late(now).split([part.shape[1] for part in parts.values()], 1)
+        self.keep(now, mask)
+        return dict(zip(parts, late, strict=True))

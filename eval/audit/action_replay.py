@@ -88,7 +88,7 @@ def found_probability(forged: float, episodes: int) -> float:
 def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
     """Flags by which the episodes of a run are played here with a policy, and flags of more kinds of the run."""
     groups_of = (name for kind in (Conditions, Batch, Stepping, *kinds) for name in flags_of(kind))
-    others = (*Remote.names_for(policy), "task", "tracker", "seeds", "repeats", "checkpoint")
+    others = (*Remote.names_for(policy), "task", "tracker", "seeds", "repeats", "checkpoint", "recorder")
     same = {name: getattr(stored, name) for name in (*groups_of, *others)}
     return RunOptions(**same | {"policy": policy, "engine": ENGINE, "device": "cpu", "actions": False})
 
@@ -185,7 +185,7 @@ def _play(
     run, wanted = audit.run, {_key(record): record for record in records}
     plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
-    measured = made.recorders is not Factories.recorders
+    measured = bool(stored.recorder) or made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
     made = dataclasses.replace(made, tracker=_without_window(made, f"--replay: {run.folder}"))
     with contextlib.ExitStack() as ended:
@@ -304,7 +304,7 @@ def played(
             env,
             policy,
             group,
-            recorder=[*recorders, *made.recorders(env)],
+            recorder=[*recorders, *made.measuring(env, config.flags.recorder)],
             max_steps=group[0].max_steps,
             latency=latency,
             on_finish=results.append,

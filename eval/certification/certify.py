@@ -157,6 +157,9 @@ def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str,
         trackers.check_spec(tracker)
         if tracker in options.tracker[:position]:
             raise InputError(f"--tracker {tracker}: given twice")
+        if getattr(factories.tracker(tracker, None), "lookahead", 0):
+            why = "reads the coming reference, which recorded actions do not hold: no replay of its episodes is equal"
+            raise InputError(f"--tracker {tracker}: {why}, and certify compares them")
     if not options.tracker:
         raise InputError("--tracker: nothing given, at least one is needed")
     if options.episodes is not None and not 1 <= options.episodes <= MAX_EPISODES:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from arena_newton import __version__, policies, rule_sets, trackers
+from arena_newton import __version__, policies, recorders, rule_sets, trackers
 from arena_newton import tasks as task_specs
 from arena_newton.cli.flags import check_least, shared
 from arena_newton.data.readers.looks import MOST_LIGHTS
@@ -312,6 +312,8 @@ def resolve(options: RunOptions) -> RunConfig:
     for tracker in used:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
+    for recorder in options.recorder:
+        recorders.check(recorder)
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"

@@ -253,6 +253,8 @@ class RunOptions(
     repeats.
     """
 
+    recorder: Several[str] = ()
+    """Recorders of other packages (entry points `arena_newton.recorders`), whose metrics are in journal and tables."""
     viewer_failures: bool = False
     """Write a .viser recording of each episode that fails, to walk around in."""
     actions: bool = True

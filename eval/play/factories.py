@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from arena_newton import policies, trackers
+from arena_newton import policies, recorders, trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.interfaces import Recorder, World
 from arena_newton.policies.base import Policy
@@ -34,3 +34,7 @@ class Factories:
     """Raises InputError for a file that is not a scene of the task."""
     recorders: Callable[[World], Sequence[Recorder]] = _no_recorders
     """Recorders of an environment, made once for it; their metrics are in the journal (`EpisodeResult.extra`)."""
+
+    def measuring(self, env: World, named: Sequence[str]) -> list[Recorder]:
+        """Recorders of an environment: those of the program, then those of `--recorder`."""
+        return [*self.recorders(env), *(recorders.get(name, env) for name in named)]

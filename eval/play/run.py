@@ -285,7 +285,7 @@ class RunPlayer:
         try:
             env = make_env(config, self.factories, episodes[0], self.batch or min(flags.worlds, len(episodes)))
             own = env.describe() | {PROCESSOR: torch.backends.cpu.get_cpu_capability()} | shown_by(config.cameras)
-            research = self.factories.recorders(env)
+            research = self.factories.measuring(env, flags.recorder)
             measuring = (self.factories.recorders, *research) if research else ()  # numbers may stand in either
             own |= {"recorders": config_hash(sorted({own_code(one) or "" for one in measuring}))} if measuring else {}
             for names in groups(order):

@@ -29,7 +29,14 @@ from arena_newton.policies.train.frames.frame_store import FrameStore, is_pad, l
 from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers, look_changes, look_fractions, recipe_values, task_weights
+from arena_newton.policies.train.policy_options import (
+    PolicyTrainOptions,
+    check_numbers,
+    look_changes,
+    look_fractions,
+    recipe_values,
+    task_weights,
+)
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop

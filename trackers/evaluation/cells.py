@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from arena_newton.trackers.evaluation import push_suite
 from arena_newton.trackers.evaluation.suite import Ball, Cell, Navigation, Placed, Push
 from arena_newton.trackers.motions import primitives as p
 from arena_newton.trackers.motions.primitives import Script
@@ -142,7 +143,9 @@ def goals(count: int = GOALS, seed: int = 0) -> list[Cell]:
 
 
 def suite(name: str) -> list[Cell]:
-    """`full` or `quick`."""
+    """`full`, `quick` or `push`."""
+    if name == "push":
+        return push_suite.cells()
     cells = [*_standing(), *_walking(), *_posture(), *_seated(), *_contact()]
     if name == "quick":
         return [cell for cell in cells if cell.name in QUICK] + goals(4)

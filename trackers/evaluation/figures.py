@@ -10,6 +10,7 @@ import numpy as np
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.trackers import interface
+from arena_newton.trackers.evaluation import push_suite
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.suite_rollout import Outcome, Plan
 
@@ -206,6 +207,27 @@ def _standing_ball(sample: Sample) -> Numbers:
     return {"hit": 0.0} | _ball(sample)  # the hits are judged: they come first
 
 
+def _blows(sample: Sample) -> Numbers:
+    up, blows, survived = (
+        int((~sample.fell).sum()),
+        sample.measures["blows"].sum(),
+        sample.measures["blows_survived"].sum(),
+    )
+    recovery = sample.measures["recovery"][np.isfinite(sample.measures["recovery"])]
+    low, high = wilson(up, len(sample.fell))
+    return {
+        "fraction": up / len(sample.fell),
+        "up": up,
+        "percent": 100 * up / len(sample.fell),
+        "low": 100 * low,
+        "high": 100 * high,
+        "seconds": sample.mean("survival"),
+        "blows": 100 * survived / max(blows, 1.0),
+        "recovery": recovery.mean() if len(recovery) else np.nan,
+    }
+
+
+_TOUR = "{up}/{count} = {percent:.0f} % [{low:.0f}, {high:.0f}], {seconds:.1f} s; blows {blows:.1f} %, {recovery:.2f} s"
 _BALL = "median {median:.1f} m/s (rolls {rolls:.1f}), {percent:.0f} % ≥ 1.5 m/s, falls {fell}/{count}"
 
 
@@ -247,6 +269,7 @@ BARS: tuple[FigureBar, ...] = (
         "{mean:.2f} m/s, falls {fell}/{count}", "≥ {limit:g} m/s, no fall", 0.2, at_least=True, no_fall=True),
     FigureBar("push of 40 N·s in 0.1 s while walking, falls", ("push 40 N·s, walk 0.3", "push 40 N·s, walk 0.6"),
         _fall_rate, "{falls}", "≤ {percent:g} %", 0.15),
+    *(FigureBar(f"60 s on both feet: {cell.name}", (cell.name,), _blows, _TOUR, "") for cell in push_suite.cells()),
 )
 # fmt: on
 """Figures in the order of the table."""

@@ -143,8 +143,10 @@ class Lab:
         self.device = wp.device_to_torch(p.device)
         self.qpos, self.qvel, self.xpos = wp.to_torch(p.qpos), wp.to_torch(p.qvel), wp.to_torch(p.xpos)
         self.pair_force = wp.to_torch(p.pair_force)
-        self.force: torch.Tensor = wp.to_torch(p.external_force)[:, self.scene.link(CHEST), :3]
-        """Force on the chest [N], world frame, shape [worlds, 3]; stays until changed."""
+        self.forces: torch.Tensor = wp.to_torch(p.external_force)[:, :, :3]
+        """Force on each body at its centre of mass [N], world frame, shape [worlds, bodies, 3]; stays until changed."""
+        self.force: torch.Tensor = self.forces[:, self.scene.link(CHEST)]
+        """Force on the chest, shape [worlds, 3]; a view."""
         self.joint_q, self.joint_v = (
             torch.as_tensor(addresses, dtype=torch.long, device=self.device)
             for addresses in (h.joint_qpos, h.joint_qvel)

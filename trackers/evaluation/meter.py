@@ -62,13 +62,14 @@ class TickReference:
 class Meter:
     """Accumulators of a batch of rollouts; `update` after every tick, `results` once at the end."""
 
-    def __init__(self, lab: Lab, end: np.ndarray, window: np.ndarray):
+    def __init__(self, lab: Lab, end: np.ndarray, window: np.ndarray, *, traced: int = 0):
         """Allocate.
 
         Args:
             lab: The worlds.
             end: Length of each rollout [ticks], shape [worlds].
             window: First tick that counts for mean speeds, shape [worlds].
+            traced: Number of ticks whose errors are kept.
         """
         self.lab = lab
         w, device = lab.worlds, lab.device
@@ -84,6 +85,9 @@ class Meter:
         self.fallen = torch.zeros(w, dtype=torch.bool, device=device)
         """Worlds that have fallen, [worlds]."""
         self.fall_tick = torch.full((w,), -1, dtype=torch.long, device=device)
+        self.errors: torch.Tensor = torch.full((traced, w, 2), torch.nan, device=device)
+        """Link error [m] and planar velocity error [m/s] of each tick that is kept, NaN after a fall or the end, shape
+        [ticks, worlds, 2]."""
         self._links, self._feet = indices(LINKS), indices(FEET)
         drive = lab.scene.drive
         self._kp, self._kd, self._effort = (torch.tensor(v, device=device) for v in (drive.kp, drive.kd, drive.effort))
@@ -162,13 +166,16 @@ class Meter:
         torque = (self._kp * (targets - joints) - self._kd * speed) / self._effort
         ref_up = 1.0 - 2.0 * (reference.quat[:, 1].square() + reference.quat[:, 2].square())
 
+        velocity = (moved - ref_moved).square().sum(1)
+        if tick < len(self.errors):
+            self.errors[tick] = torch.where(live[:, None], torch.stack([link, velocity.sqrt()], dim=1), torch.nan)
         values = torch.stack(
             [
                 error.mean(1),
                 error[:, LEGS].mean(1),
                 error[:, ARMS].mean(1),
                 link,
-                (moved - ref_moved).square().sum(1),
+                velocity,
                 (position[:, 2] - reference.position[:, 2]).abs(),
                 (torch.acos(up.clamp(-1, 1)) - torch.acos(ref_up.clamp(-1, 1))).abs(),
                 (slip * down).sum(1),

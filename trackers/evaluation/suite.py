@@ -19,7 +19,7 @@ from arena_newton.trackers.motions.kinematics import forward, link_index
 from arena_newton.trackers.motions.playback import startup_actions
 from arena_newton.trackers.motions.primitives import Program, Script
 
-__all__ = ["Ball", "Cell", "Navigation", "Placed", "Push", "Tables", "clip_cells", "tabulate"]
+__all__ = ["Ball", "Blows", "Cell", "Navigation", "Placed", "Push", "Tables", "clip_cells", "tabulate"]
 
 BLEND = 1.0
 """Time from standing to a clip's first pose [s]."""
@@ -64,6 +64,24 @@ class Push:
 
 
 @dataclass(frozen=True)
+class Blows:
+    """One short force in each segment of a reference, on a drawn link of the robot in a drawn direction."""
+
+    newtons: float
+    """Size, or the largest one where it is drawn [N]."""
+    segments: int
+    """Number of blows."""
+    spacing: float = 5.0
+    """Length of a segment [s]."""
+    begin: tuple[float, float] = (0.1, 2.0)
+    """Earliest and latest begin within a segment [s], drawn for each blow."""
+    seconds: float = 0.08
+    """Duration [s]."""
+    ramp: bool = False
+    """Draw each from half of a bound to the bound, which climbs from a third of `newtons` to `newtons` over all."""
+
+
+@dataclass(frozen=True)
 class Navigation:
     """A goal reached in closed loop; the goals of a suite are drawn once, from the seed."""
 
@@ -97,6 +115,9 @@ class Cell:
     support: Placed | None = None
     ball: Ball | None = None
     push: Push | None = None
+    blows: Blows | None = None
+    latency: int = 0
+    """Age of the state that the tracker gets, and lateness of its joint targets [ticks]."""
     window: float = 2.0
     """Mean speeds are taken from here on [s]."""
     rollouts: int | None = None

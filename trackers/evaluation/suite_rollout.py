@@ -28,7 +28,7 @@ from arena_newton.trackers.motions.navigate import NavigationLimits, Navigator
 from arena_newton.trackers.motions.programs import SILL_SIZE, place_platform
 from arena_newton.tracking import TrackerLoop
 
-__all__ = ["Outcome", "Plan", "Settings", "SuiteRollout", "find_sill", "make_plan", "play"]
+__all__ = ["Outcome", "Plan", "Settings", "SuiteRollout", "begins", "find_sill", "make_plan", "play"]
 
 BALL_RADIUS = 0.11
 """[m]"""
@@ -64,12 +64,24 @@ class Plan:
     noise: dict[str, np.ndarray]
     """Draws of each world."""
     _tables: dict[torch.device, Tables] = field(default_factory=dict, repr=False)
+    _whole: Plan | None = field(default=None, repr=False)
+    """The plan of which this is one cell."""
 
     def tables(self, device: torch.device) -> Tables:
         """References of all cells, rolled out once per device."""
         if device not in self._tables:
-            self._tables[device] = tabulate(self.cells, device)
+            if self._whole is None:
+                self._tables[device] = tabulate(self.cells, device)
+            else:
+                whole, at = self._whole.tables(device), [self._whole.cells.index(cell) for cell in self.cells]
+                self._tables[device] = Tables(whole.actions[:, at], whole.links[:, at], whole.feet[:, at])
         return self._tables[device]
+
+    def only(self, number: int) -> Plan:
+        """One cell with its draws; its references are taken from those of all cells."""
+        rows = self.cell == number
+        noise = {name: values[rows] for name, values in self.noise.items()}
+        return Plan([self.cells[number]], np.zeros(rows.sum(), dtype=int), noise, _whole=self)
 
 
 @dataclass
@@ -89,6 +101,8 @@ class Outcome:
     """Wall-clock time of building worlds and references [s]."""
     rollout_s: float
     """Wall-clock time of the rollouts [s]."""
+    errors: np.ndarray | None = None
+    """`Meter.errors` of plans with blows, [ticks, worlds, 2]."""
 
 
 def make_plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
@@ -111,6 +125,7 @@ def make_plan(cells: list[Cell], rollouts: int, seed: int) -> Plan:
                 axis=1,
             ),
             "unit": rng.uniform(0.0, 1.0, (count, 3)),
+            "blows": rng.uniform(0.0, 1.0, (count, max(one.blows.segments if one.blows else 0 for one in cells), 5)),
         }
         for name, values in draws.items():
             noise.setdefault(name, []).append(values)
@@ -208,6 +223,52 @@ class _Forces:
         return torch.stack([size * torch.cos(angle), size * torch.sin(angle), torch.zeros_like(size)], dim=1)
 
 
+class _Blows:
+    """Blows of all worlds, computed on the device; worlds and blows without one have a force of 0."""
+
+    def __init__(self, plan: Plan, lab: Lab):
+        unit = plan.noise["blows"]
+        worlds, most = unit.shape[:2]
+        size, length = np.zeros((worlds, most)), np.zeros((worlds, 1))
+        self.begin = begins(plan)
+        for i, cell in enumerate(plan.cells):
+            if (blows := cell.blows) is not None:
+                rows, numbers = plan.cell == i, np.arange(blows.segments)
+                size[rows, : blows.segments] = blows.newtons
+                if blows.ramp:
+                    bound = 1 / 3 + 2 / 3 * numbers / blows.segments
+                    size[rows, : blows.segments] *= bound * (0.5 + 0.5 * unit[rows, : blows.segments, 4])
+                length[rows] = round(blows.seconds / g1.TICK)
+        robot, m = lab.scene.robot, lab.scene.mj_model
+        links = m.jnt_bodyid[m.dof_jntid[robot.joint_qvel]]
+        turn, up = 2 * np.pi * unit[..., 1], 2 * unit[..., 2] - 1
+        level = np.sqrt(1 - up**2)
+        force = size[..., None] * np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=-1)
+        device = lab.device
+        self._links = torch.as_tensor(links[(unit[..., 3] * len(links)).astype(int)], dtype=torch.long, device=device)
+        self._force = torch.as_tensor(force, dtype=torch.float32, device=device)
+        self._begin, self._end = (torch.as_tensor(at, device=device) for at in (self.begin, self.begin + length))
+        self._rows = torch.arange(worlds, device=device)[:, None]
+
+    def add(self, tick: int, forces: torch.Tensor) -> None:
+        """Add this tick's forces [N], world frame, to those on the bodies, [worlds, bodies, 3]."""
+        now = (self._begin <= tick) & (tick < self._end)
+        forces.index_put_((self._rows, self._links), self._force * now[..., None], accumulate=True)
+
+
+def begins(plan: Plan) -> np.ndarray:
+    """Ticks at which the blows of each world begin, NaN where a world has fewer, [worlds, blows]."""
+    unit = plan.noise["blows"][..., 0]
+    out = np.full(unit.shape, np.nan)
+    for i, cell in enumerate(plan.cells):
+        if (blows := cell.blows) is not None:
+            early, late = blows.begin
+            drawn = early + (late - early) * unit[plan.cell == i, : blows.segments]
+            at = np.round((np.arange(blows.segments) * blows.spacing + drawn) / g1.TICK)
+            out[plan.cell == i, : blows.segments] = at
+    return out
+
+
 class _Goals:
     """Closed-loop references of the worlds that have a goal."""
 
@@ -251,11 +312,15 @@ class SuiteRollout:
         self.start = _start(plan, self.tables)
         end = np.array([c.ticks for c in cells])[cell]
         self.ticks = int(end.max())
-        self.meter = Meter(self.lab, end, np.array([round(c.window / g1.TICK) for c in cells])[cell])
+        struck = any(c.blows is not None for c in cells)
+        window = np.array([round(c.window / g1.TICK) for c in cells])[cell]
+        self.meter = Meter(self.lab, end, window, traced=self.ticks if struck else 0)
         self.loop = TrackerLoop(self.lab.physics, self.lab.scene.robot, tracker)
         self._every = np.ones(self.lab.worlds, dtype=bool)
         self._cell = torch.as_tensor(cell, dtype=torch.long, device=self.lab.device)
         self._forces = _Forces(plan, self.lab.device)
+        self._blows = _Blows(plan, self.lab) if struck else None
+        self._latency = [{"state_latency": n, "action_latency": n} if (n := cells[i].latency) else {} for i in cell]
         self._goals = _Goals(plan, self.lab.device) if any(c.goal is not None for c in cells) else None
         self._position = wp.to_torch(self.loop.reference.position)
         self.setup_s = time.perf_counter() - began
@@ -264,6 +329,7 @@ class SuiteRollout:
     def prepare(self) -> None:
         """Put every world at its start, with the first action as a command to stand still."""
         self.lab.start(self.start)
+        self.loop.delay(np.arange(self.lab.worlds), self._latency)
         self.loop.fresh(self._every, prefill=True)
         self.loop.anchor(self._every)
         action = self.loop.action
@@ -294,8 +360,12 @@ class SuiteRollout:
                 self._goals.write(self._pose(), loop.action)
             if loop.lookahead:
                 loop.announce(self._coming(tick))
+            if self._blows is not None:
+                lab.forces.zero_()
             if self._forces.any:
                 lab.force.copy_(self._forces.at(tick, self._pose()[:, 2]))
+            if self._blows is not None:
+                self._blows.add(tick, lab.forces)
         targets = loop.tick(loop.action, self._every)
         lab.physics.step()
         links = self.tables.links[max(tick, 0)].index_select(0, self._cell)
@@ -326,6 +396,7 @@ class SuiteRollout:
             rate=self.rate,
             setup_s=self.setup_s,
             rollout_s=time.perf_counter() - self._began,
+            errors=None if self._blows is None else self.meter.errors.cpu().numpy(),
         )
 
 

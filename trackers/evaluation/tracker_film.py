@@ -11,6 +11,7 @@ from arena_newton.interfaces import Tracker
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.pictures.video import film_strip
 from arena_newton.robot.g1 import TICK
+from arena_newton.trackers.evaluation import push_suite
 from arena_newton.trackers.evaluation.cells import suite
 from arena_newton.trackers.evaluation.lab import Lab
 from arena_newton.trackers.evaluation.suite_rollout import Settings, make_plan, play
@@ -19,12 +20,16 @@ __all__ = ["FILMED", "film"]
 
 FILMED = {"walk 0.6": "walk", "ball, standing kick": "kick", "squat 0.45": "squat", "sit 0.42": "sit"}
 """Cell to file name."""
+FILMED_PUSHES = {push_suite.RAMP: "blows"}
+"""The same for the push suite."""
 PICTURES = 10
 """Pictures per strip."""
 WIDTH, HEIGHT = 256, 256
 SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
+SHOWN[push_suite.RAMP] = (0.0, 60.0)
 """Part of each rollout that is shown [s]."""
 VIEWS = {"walk 0.6": (1.2, 4.6), "ball, standing kick": (0.4, 2.6), "squat 0.45": (0.1, 2.6), "sit 0.42": (-0.1, 2.6)}
+VIEWS[push_suite.RAMP] = (0.8, 6.5)
 """Middle of the picture along the robot's path and distance of the camera to its right [m]."""
 EYE, GAZE = 1.05, 0.72
 """Heights of the camera and of its target [m]."""
@@ -84,15 +89,18 @@ def film(
     label: str,
     out: Path,
     *,
+    blows: bool = False,
     seed: int = 0,
     fast_physics: bool = False,
     **settings: Unpack[Settings],
 ) -> list[Path]:
     """Play the filmed cells once and write one strip per cell into a folder; returns the files.
 
-    File names and the line above a strip call the tracker `label`; the rest is as in `suite_rollout.play`.
+    File names and the line above a strip call the tracker `label`; `blows` films the push suite's ramp instead; the
+    rest is as in `suite_rollout.play`.
     """
-    cells = [cell for cell in suite("full") if cell.name in FILMED]
+    files = FILMED_PUSHES if blows else FILMED
+    cells = [cell for cell in suite("push" if blows else "full") if cell.name in files]
     names = [cell.name for cell in cells]
     camera = _StripCamera(names)
     plan = make_plan(cells, 1, seed)
@@ -100,7 +108,7 @@ def film(
     safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in label)
     written = []
     for name, frames in zip(names, camera.frames, strict=True):
-        path = out / f"film_{safe}_{FILMED[name]}.png"
+        path = out / f"film_{safe}_{files[name]}.png"
         first, last = SHOWN[name]
         written.append(film_strip(frames, path, n=PICTURES, label=f"{label}: {name}, {first:g} to {last:g} s"))
     return written

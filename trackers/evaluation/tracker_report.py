@@ -29,6 +29,12 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "torque": ("torque [of limit]", ".3f"),
 }
 """Measures of the printed tables: heading and format; JSON and CSV hold all of them."""
+PUSH_COLUMNS: dict[str, tuple[str, str]] = {
+    "survival": ("survival [s]", ".1f"),
+    "recovery": ("recovery [s]", ".2f"),
+    "recovered": ("recovered", ".0%"),
+}
+"""Further measures, in tables of cells that have them."""
 RULE = (" --- ", " --: ")
 """Marks under the heads of the tables."""
 
@@ -111,14 +117,15 @@ def _shown(figure: Figure | None) -> str:
 
 
 def _table(entries: Sequence[dict[str, Any]], key: str) -> str:
-    rows = []
+    struck = any("survival" in entry for entry in entries)
+    columns, rows = (PUSH_COLUMNS if struck else {}) | COLUMNS, []
     for entry in entries:
         numbers = [
-            "–" if entry.get(name) is None else format(entry[name], pattern) for name, (_, pattern) in COLUMNS.items()
+            "–" if entry.get(name) is None else format(entry[name], pattern) for name, (_, pattern) in columns.items()
         ]
         interval = f"[{100 * entry['fall_rate_low']:.1f}, {100 * entry['fall_rate_high']:.1f}] %"
         rows.append((entry[key], entry["tracker"], f"{entry['falls']}/{entry['rollouts']}", interval, *numbers))
-    head = (key, "tracker", "falls", "[95 %]", *(title for title, _ in COLUMNS.values()))
+    head = (key, "tracker", "falls", "[95 %]", *(title for title, _ in columns.values()))
     return "\n".join(Table(head, rows).compact(rule=RULE))
 
 

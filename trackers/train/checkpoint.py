@@ -51,6 +51,8 @@ class Card(TrainingPart):
     """`PhysicsRate` as a dictionary."""
     rewards: dict[str, float] = field(default_factory=dict)
     """Weights of the reward terms."""
+    events: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Settings of the events of the randomisation; none without it."""
     started_from: str | None = None
     """Commit of the weights with which the training started."""
     earlier: list[dict[str, Any]] = field(default_factory=list)
@@ -58,7 +60,7 @@ class Card(TrainingPart):
 
     def to_dict(self) -> dict[str, Any]:
         """The card as JSON, without what does not apply."""
-        return {k: v for k, v in vars(self).items() if not (k in ("started_from", "earlier") and not v)}
+        return {k: v for k, v in vars(self).items() if not (k in ("events", "started_from", "earlier") and not v)}
 
     def resume(self, previous: Checkpoint) -> None:
         """Add the parts of the training that this one continues, and all of their licences."""

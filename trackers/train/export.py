@@ -129,6 +129,10 @@ def _markdown(card: dict[str, Any]) -> str:
         "licences of the data": ", ".join(f"{name} ({count} clips)" for name, count in card["licences"].items()),
         "sources of the data": "; ".join(card["data"]["sources"]),
     }
+    if drawn := card.get("events"):
+        rows["randomisation"] = "; ".join(
+            f"{n} " + ", ".join(f"{k} {v:g}" for k, v in e.items()) for n, e in drawn.items()
+        )
     for k, part in enumerate(card.get("earlier", ()), start=1):
         rows[f"part {k}"] = f"to iteration {part['iter']}, commit {part['commit']}: `{part['command']}`"
     if started := card.get("started_from"):

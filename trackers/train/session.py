@@ -30,6 +30,7 @@ from arena_newton.trackers.train.checkpoint import Card, Checkpoint
 from arena_newton.trackers.train.export import export
 from arena_newton.trackers.train.runner import TrackerRunner
 from arena_newton.trackers.train.simulation import share_stream
+from arena_newton.trackers.train.terms import events
 from arena_newton.trackers.train.terms.rewards import configured, maximum
 from arena_newton.trackers.train.tracker_env import TrackerEnv
 from arena_newton.trackers.train.train_options import (
@@ -119,6 +120,7 @@ def _card(options: TrainOptions, library: MotionLibrary, env: TrackerEnv, proces
         drive=env.interface.drive.as_json(),
         physics=dataclasses.asdict(env.interface.rate),
         rewards={name: term.weight for name, term in env.rewards.items()},
+        events={name: dict(event.settings) for name, event in env.events.items()},
     )
 
 
@@ -180,6 +182,7 @@ def build(options: TrainOptions) -> TrackerRunner:
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise InputError("--logger wandb: the package wandb is not installed")
     rewards = configured(options.rewards, options.reward_scales)
+    randomisation = events.configured(options.events)
     with naming("--tracker"):
         interface = get(options.tracker)
     device = str(torch_device(options.device))
@@ -198,7 +201,16 @@ def build(options: TrainOptions) -> TrackerRunner:
     library = make_library(options, device, options.seed + 1000 * rank)
     generated = time.monotonic()
     weights = _family_weights(options, library)
-    env = TrackerEnv(interface, form, library.to(device), options, device, rewards=rewards, family_weights=weights)
+    env = TrackerEnv(
+        interface,
+        form,
+        library.to(device),
+        options,
+        device,
+        rewards=rewards,
+        randomisation=randomisation,
+        family_weights=weights,
+    )
     if rank == 0:
         print(
             f"{library.clips} clips, {library.seconds.sum() / 60.0:.1f} min of motion in {generated - began:.1f} s; "
@@ -224,10 +236,13 @@ def _runner(env: TrackerEnv, options: TrainOptions, card: Card, checkpoint: Chec
 
 
 def _tables(env: TrackerEnv) -> str:
-    """Reward terms and critic terms of a training, as text."""
+    """Reward terms, events and critic terms of a training, as text."""
     lines = [f"reward per second, at most {maximum(env.rewards):.2f}:"]
     for name, term in env.rewards.items():
         lines.append(f"  {name:20} weight {term.weight:<8g}" + (f" scale {term.scale:g}" if term.scale else ""))
+    lines.append("randomisation:" if env.events else "no randomisation")
+    for name, event in env.events.items():
+        lines.append(f"  {name:20} " + " ".join(f"{key} {value:g}" for key, value in event.settings.items()))
     lines.append(f"observation of the critic, {sum(env.critic_widths.values())} numbers:")
     return "\n".join(lines + [f"  {name:20} {width}" for name, width in env.critic_widths.items()])
 

@@ -20,6 +20,7 @@ from tensordict import TensorDict
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.kernels.newton_state import LOST_CONTACTS
+from arena_newton.physics.dynamics import Delay
 from arena_newton.robot import rotations
 from arena_newton.robot.g1 import DEFAULT_POSE, TICK
 from arena_newton.trackers.train.graphs import captured
@@ -88,8 +89,15 @@ class TrackerEnv(VecEnv):
         self.sampler = ClipSampler(self.bank, options.adaptive, dict(family_weights or {}))
         self.sim = Simulation(interface.drive, interface.rate, options, device)
         self._every = torch.ones(worlds, dtype=torch.bool, device=device)
-        self.delay: torch.Tensor = torch.zeros(worlds, dtype=torch.bool, device=device)
-        """True if a world's targets arrive one tick late, bool, shape [worlds]."""
+        self.late_targets: Delay = Delay(worlds, 29, torch.device(device))
+        """Latency of each world's joint targets."""
+        drawn = self.events.get("state_delay")
+        self._state_ages = drawn is not None and drawn.settings["fraction"] > 0.0
+        if not self._state_ages:
+            self.critic.pop("state_delay", None)  # checkpoints of trainings without it can be resumed
+        width = 65 + 3 * len({"position", "lin_vel"} & set(front_end.needs))
+        self.late_state: Delay = Delay(worlds, width if self._state_ages else 0, torch.device(device))
+        """Latency of the state that each world's tracker gets; of no state where the events draw none."""
         zero = torch.zeros(worlds, 1, device=device)
         self.privileged: dict[str, torch.Tensor] = {
             "friction": zero,
@@ -131,7 +139,6 @@ class TrackerEnv(VecEnv):
 
         self.episode_length_buf, self.frame = zeros(worlds, dtype=torch.long), zeros(worlds, dtype=torch.long)
         self._action, self._last_action = zeros(worlds, self.num_actions), zeros(worlds, self.num_actions)
-        self._targets = zeros(worlds, 29)
         self._feet, self._foot_vel = zeros(worlds, 2, 3), zeros(worlds, 2, 3)
         self._next_rows = zeros(worlds, self.bank.data.shape[1])
         self.ahead: Frame = self.bank.split(self._next_rows)
@@ -194,10 +201,10 @@ class TrackerEnv(VecEnv):
         return self.get_observations(), self._reward, self._done, {"time_outs": self._time_out}
 
     def _before(self) -> None:
-        """Turn raw actions into targets, some of them one tick late."""
+        """Turn raw actions into targets, some of them late."""
         targets = self.front_end.act(self._action)
-        self.sim.targets.copy_(torch.where(self.delay[:, None], self._targets, targets))
-        self._targets.copy_(targets)
+        self.sim.targets.copy_(self.late_targets.late(targets))
+        self.late_targets.keep(targets, self._every)
 
     def _after(self) -> None:
         """Judge the new state, start ended worlds again, make the next observations."""
@@ -292,7 +299,8 @@ class TrackerEnv(VecEnv):
         put(sim.joint_pos, around(start.joint_pos, "joint_pos").clamp(low, high))
         put(sim.joint_vel, around(start.joint_vel, "joint_vel"))
         put(sim.warmstart, 0.0)
-        put(self._targets, start.joint_pos)
+        self.late_targets.forget(mask)
+        self.late_targets.keep(start.joint_pos, mask)
         self._action.masked_fill_(row, 0.0)
         self._foot_vel.masked_fill_(row[:, None], 0.0)
         sim.overflow.masked_fill_(mask, 0)
@@ -322,6 +330,9 @@ class TrackerEnv(VecEnv):
             state.position = self.sim.root_pos
         if "lin_vel" in self.front_end.needs:
             state.lin_vel = self.sim.root_vel
+        if self._state_ages:
+            self.late_state.forget(first)
+            state = RobotState(**self.late_state.late_parts(state.tensors(), self._every))
         self.front_end.reset(first)
         if self.cfg.randomise:
             first = first & (torch.rand(self.num_envs, device=self.device) < _PREFILL)

@@ -85,6 +85,8 @@ class TrainOptions:
     """Scales of tracking rewards exp(-error² / scale²) by name, e.g. `--reward-scales legs 0.1`."""
     randomise: bool = True
     """Domain randomisation, observation noise and pushes."""
+    events: Several[tuple[str, str, float]] = ()
+    """Settings of events of the randomisation, where not those of the table, e.g. `--events push planar 1.6`."""
     adaptive: float = field(default=0.25, metadata=bounds(0, 1))
     """Fraction of the episodes that start where the tracker fails."""
     episode_s: float = field(default=10.0, metadata=bounds(0.1, 3600))
@@ -131,7 +133,7 @@ class TrainOptions:
     bench: bool = False
     """Measure only: train for `--minutes` (one by default), write nothing, print samples/s."""
     verbose: bool = False
-    """Print the tables of reward terms and of the critic's observation first."""
+    """Print the tables of reward terms, of events and of the critic's observation first."""
     commit: str = ""
     """Commit for the card where git is not available."""
 
@@ -181,6 +183,8 @@ def check(options: TrainOptions) -> None:
     check_number("--minibatches", options.minibatches, 1, (options.worlds or CPU_WORLDS) * options.steps)
     if options.anneal > 0.0 and options.minutes <= 0.0:
         raise InputError(f"--anneal {options.anneal}: a fraction of --minutes, which is not given")
+    if options.events and not options.randomise:
+        raise InputError("--events: sets the randomisation that --no-randomise leaves out")
     if options.resume is not None and options.start_from is not None:
         raise InputError("--resume continues a training, --start-from begins one: pass one of the two")
     if options.library is not None and options.families:

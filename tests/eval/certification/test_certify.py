@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories
+from eval_fakes import LEAP, SLOW, FakeEnv, FakePolicy, factories, fake_tracker
 
 from arena_newton import tasks
 from arena_newton.errors import InputError
@@ -222,6 +222,19 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, flags, message):
     assert main(["certify", *flags]) == 2
     assert re.fullmatch(rf"error: .*{re.escape(message)}.*\n", capsys.readouterr().err)
     assert not (tmp_path / "results").exists()
+
+
+def test_a_window_is_refused_by_name(tmp_path):
+    """Recorded actions do not hold what a look-ahead tracker reads: it is refused, not accused of unequal replays."""
+
+    def seeing(spec, checkpoint):
+        made = fake_tracker(spec, checkpoint)
+        made.lookahead = 2 if spec == "sonic" else 0
+        return made
+
+    with pytest.raises(InputError, match="--tracker sonic: reads the coming reference, which recorded actions do not"):
+        certify.run(options(tmp_path), factories(**PARTS, tracker=seeing), checks=CHECKS)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_an_interrupt_says_how_to_go_on(tmp_path, capsys):

@@ -206,6 +206,9 @@ def test_a_training_says_first_what_it_builds(tmp_path, monkeypatch, capsys):
     assert said.err == "error: 16 worlds\n"
 
 
+DELAYED = {"fraction": 1.0, "ticks": 3.0}
+
+
 class ForeseeingFrontEnd(Twist2FrontEnd):
     """TWIST2's front end that is given state estimation and a window, and keeps what it is given."""
 
@@ -234,3 +237,53 @@ def test_declared_fields_are_given_in_training(library):
     blind = dataclasses.replace(foreseeing, front_end=type("Feet", (Twist2FrontEnd,), {"needs": ("foot_force",)}))
     with pytest.raises(InputError, match="'twist2': needs foot_force, which training does not measure"):
         TrackerEnv(blind, form, library.to("cpu"), TrainOptions(worlds=2))
+
+
+def test_events_are_options():
+    """Events take other settings by name; what is unknown or out of range is refused with its flag."""
+    changed = events.configured([("push", "planar", 2.0), ("push", "every", 3.0), ("action_delay", "ticks", 2.0)])
+    assert changed["push"].settings == dict(events.EVENTS["push"].settings) | {"planar": 2.0, "every": 3.0}
+    assert changed["action_delay"].settings["ticks"] == 2.0 and changed["friction"] == events.EVENTS["friction"]
+    assert list(changed) == list(events.EVENTS)
+    for change, words in (
+        (("shove", "planar", 1.0), "--events shove: no such event; known are friction"),
+        (("push", "planer", 1.0), "--events push planer: no such setting; push has every, planar"),
+        (("payload", "fraction", 1.5), "--events payload fraction 1.5: expected a number from 0 to 1"),
+        (("action_delay", "ticks", 1.5), "--events action_delay ticks 1.5: expected a whole number"),
+        (("state_delay", "ticks", 11.0), "from 1 to 10"),
+        (("friction", "low", 2.0), "--events friction: low 2 is above high 1.2"),
+        (("push", "planar", float("nan")), "--events push planar nan"),
+    ):
+        with pytest.raises(InputError, match=words):
+            events.configured([change])
+
+
+def test_late_signals_are_what_the_tracker_lives_with(library):
+    """With both latencies drawn, targets arrive and states are seen as many ticks late as each world drew."""
+    twist2 = interface.get("twist2")
+    changes = [(name, key, value) for name in ("action_delay", "state_delay") for key, value in DELAYED.items()]
+    quiet = [("push", "planar", 0.0), ("push", "vertical", 0.0), ("push", "turn", 0.0)]
+    torch.manual_seed(0)
+    kept = TrainOptions(worlds=8, episode_s=60.0)
+    drawn = events.configured(changes + quiet)
+    env = TrackerEnv(twist2, twist2.action_form("auto"), library.to("cpu"), kept, randomisation=drawn)
+    assert env.critic_widths["state_delay"] == 1
+    targets, given, states, seen = [], [], [], []
+    act, observe, noisy = env.front_end.act, env.front_end.observe, env._noisy_state
+    env.front_end.act = lambda action: targets.append(act(action).clone()) or targets[-1]
+    env._noisy_state = lambda: states.append(noisy()) or states[-1]
+    env.front_end.observe = lambda command, state: seen.append(state.joint_pos.clone()) or observe(command, state)
+    env.sim.step = lambda: given.append(env.sim.targets.clone())
+    env.reset(env.bank.start[torch.zeros(8, dtype=torch.long)])
+    ages = {name: getattr(env, f"late_{name}").ticks.clone() for name in ("targets", "state")}
+    assert all(1 < len(set(drawn.tolist())) and set(drawn.tolist()) <= {1, 2, 3} for drawn in ages.values()), ages
+    for _ in range(8):
+        env.sim.joint_pos.add_(0.001)
+        env.step(0.1 * torch.randn(8, env.num_actions))
+    assert env.episode_length_buf.tolist() == [8] * 8, "a world that starts again forgets"
+    states = [state.joint_pos for state in states]
+    for world in range(8):
+        targets_age, state_age = int(ages["targets"][world]), int(ages["state"][world])
+        for tick in range(3, 8):
+            assert torch.equal(given[tick][world], targets[tick - targets_age][world])
+            assert torch.equal(seen[tick + 1][world], states[tick + 1 - state_age][world])

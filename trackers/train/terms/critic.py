@@ -81,7 +81,8 @@ CRITIC: dict[str, CriticTerm] = {
     "support": support,
     "support_kind": support_kind,
     "forces": forces,
-    "action_delay": lambda env, m: env.delay[:, None].float(),
+    "action_delay": lambda env, m: env.late_targets.ticks[:, None].float(),
+    "state_delay": lambda env, m: env.late_state.ticks[:, None].float(),
     "randomised": lambda env, m: env.randomised,
 }
 

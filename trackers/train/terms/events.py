@@ -7,18 +7,23 @@ mask, so that nothing waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
 
+from arena_newton.cli.flags import check_number
+from arena_newton.errors import InputError
 from arena_newton.robot.g1 import TICK
+from arena_newton.rules.modes import MOST_LATENCY
 
 if TYPE_CHECKING:
+    from arena_newton.physics.dynamics import Delay
     from arena_newton.trackers.train.tracker_env import TrackerEnv
 
-__all__ = ["EVENTS", "OBSERVATION_NOISE", "START_NOISE", "Event", "apply", "uniform"]
+__all__ = ["EVENTS", "OBSERVATION_NOISE", "START_NOISE", "Event", "apply", "configured", "uniform"]
 
 OBSERVATION_NOISE: dict[str, float] = {"ang_vel": 0.15, "tilt": 0.03, "joint_pos": 0.01, "joint_vel": 0.4}
 """Half width of the uniform noise on what the tracker measures [rad/s, rad, rad, rad/s]."""
@@ -120,9 +125,22 @@ def motor_strength(env: TrackerEnv, mask: torch.Tensor, low: float, high: float)
     env.privileged["motor_strength"] = 10.0 * (factor - 1.0)
 
 
-def action_delay(env: TrackerEnv, mask: torch.Tensor, fraction: float) -> None:
-    """Targets arrive one tick late in a fraction of the episodes."""
-    env.delay.copy_(torch.where(mask, _chance(env.sim.qpos, fraction, env.sim.worlds), env.delay))
+def action_delay(env: TrackerEnv, mask: torch.Tensor, fraction: float, ticks: float) -> None:
+    """Targets arrive up to `ticks` late, at least one, in a fraction of the episodes."""
+    _draw_delay(env.late_targets, env, mask, fraction, ticks)
+
+
+def state_delay(env: TrackerEnv, mask: torch.Tensor, fraction: float, ticks: float) -> None:
+    """The tracker gets the state as it was up to `ticks` ago, at least one, in a fraction of the episodes."""
+    if fraction > 0.0:
+        _draw_delay(env.late_state, env, mask, fraction, ticks)
+
+
+def _draw_delay(late: Delay, env: TrackerEnv, mask: torch.Tensor, fraction: float, ticks: float) -> None:
+    drawn = _chance(env.sim.qpos, fraction, env.sim.worlds).long()
+    if ticks > 1.0:
+        drawn = drawn * torch.randint(1, int(ticks) + 1, drawn.shape, device=drawn.device)
+    late.ticks.copy_(torch.where(mask, drawn, late.ticks))
 
 
 def hand_force(env: TrackerEnv, mask: torch.Tensor, fraction: float, force: float) -> None:
@@ -187,11 +205,47 @@ EVENTS: dict[str, Event] = {
     "centre_of_mass": Event("start", centre_of_mass, {"reach": 0.01}),
     "payload": Event("start", payload, {"fraction": 0.25, "mass": 2.0}),
     "motor_strength": Event("start", motor_strength, {"low": 0.95, "high": 1.05}),
-    "action_delay": Event("reset", action_delay, {"fraction": 0.2}),
+    "action_delay": Event("reset", action_delay, {"fraction": 0.2, "ticks": 1.0}),
+    "state_delay": Event("reset", state_delay, {"fraction": 0.0, "ticks": 1.0}),
     "hand_force": Event("reset", hand_force, {"fraction": 0.1, "force": 5.0}),
     "trunk_force": Event("reset", trunk_force, {"fraction": 0.1, "force": 10.0, "resistance": 12.0}),
     "push": Event("interval", push, {"every": 5.0, "planar": 1.2, "vertical": 0.05, "turn": 0.5}),
 }
+
+
+BOUNDS: dict[str, tuple[float, float]] = {
+    "fraction": (0.0, 1.0),
+    "ticks": (1.0, float(MOST_LATENCY)),
+    "every": (TICK, 1e6),
+    "low": (0.01, 100.0),
+    "high": (0.01, 100.0),
+    "reach": (0.0, 0.2),
+}
+"""Least and largest value of settings by name; the others are from 0 to 1000."""
+
+
+def configured(changes: Sequence[tuple[str, str, float]]) -> dict[str, Event]:
+    """`EVENTS` with other settings, given as event, setting and value.
+
+    Raises:
+        InputError: An event or a setting is unknown, or a value unfit for it.
+    """
+    events = dict(EVENTS)
+    for name, key, value in changes:
+        if name not in events:
+            raise InputError(f"--events {name}: no such event; known are {', '.join(events)}")
+        settings = dict(events[name].settings)
+        if key not in settings:
+            raise InputError(f"--events {name} {key}: no such setting; {name} has {', '.join(settings)}")
+        flag = f"--events {name} {key}"
+        check_number(flag, value, *BOUNDS.get(key, (0.0, 1e3)))
+        if key == "ticks" and not float(value).is_integer():
+            raise InputError(f"{flag} {value}: expected a whole number")
+        events[name] = dataclasses.replace(events[name], settings=settings | {key: float(value)})
+    for name, event in events.items():
+        if event.settings.get("low", 0.0) > event.settings.get("high", 1e3):
+            raise InputError(f"--events {name}: low {event.settings['low']:g} is above high {event.settings['high']:g}")
+    return events
 
 
 def apply(env: TrackerEnv, when: str, mask: torch.Tensor, events: Mapping[str, Event]) -> None:
