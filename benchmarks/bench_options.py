@@ -231,7 +231,7 @@ class HonestOptions(PlainBenchOptions):
     count: int = field(default=500, metadata=bounds(1, 100_000))
     """Folders."""
     replay_every: int = field(default=3, metadata=bounds(1, 100_000))
-    """Of every so many folders two episodes are played again too."""
+    """Folders of which one has two episodes played again too."""
     seed: int = 0
     """Number by which kinds and flags are drawn."""
 

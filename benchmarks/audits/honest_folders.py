@@ -207,7 +207,7 @@ HISTORIES: dict[str, Callable[[Path, list[str], Factories, random.Random], Path]
     "packed otherwise": packed_otherwise,
     "reported again": reported,
 }
-"""What happens to a folder, by name."""
+"""Histories of a folder, by name."""
 
 
 def accusations(count: int, replayed: int, seed: int = 0) -> Iterator[tuple[str, list[str], int]]:

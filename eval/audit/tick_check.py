@@ -35,9 +35,9 @@ class TickDifferences:
     states: int = 0
     """Recorded states that were compared."""
     positions: list[np.ndarray] = field(default_factory=list)
-    """Of every body after each tick [m], each of shape [bodies, 3]."""
+    """Differences of all bodies after each tick [m], each of shape [bodies, 3]."""
     velocities: list[np.ndarray] = field(default_factory=list)
-    """Of every degree of freedom [m/s, rad/s], each of shape [nv]; of the last state they are not recorded."""
+    """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; of the last state they are not recorded."""
 
     def of_ticks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest difference of a position and of a velocity after each tick."""
@@ -77,7 +77,7 @@ class StatesAgain(Recorder):
         """Take the recordings of `eval run --record` by the episode's number."""
         self.files = files
         self.differences: dict[int, TickDifferences] = {}
-        """By the episode's number."""
+        """Differences by the episode's number."""
         self._states: dict[int, _Recorded] = {}
 
     def start(self, env: World, world: int, episode: Episode) -> None:
