@@ -240,11 +240,14 @@ class HonestOptions(PlainBenchOptions):
 class GradientBenchOptions(PlainBenchOptions):
     """Compare exact slopes of engine mujoco with finite differences, in states of the experts' episodes."""
 
+    what: tuple[str, ...] = ("all",)
+    """Figures: ticks, closed loops, replay of whole episodes, reach of slopes through a kick, featherstone (Newton's
+    solver with its tape, on CUDA where there is one), or `all`."""
     tasks: Several[str] = ()
     """Tasks; all that have an expert when none are named."""
     trackers: Several[str] = QUICK_TRACKERS
     """Trackers, whose drives differ."""
     states: int = field(default=20, metadata=bounds(2, 10_000))
     """States of each task and tracker."""
-    loops: Several[str] = ("vis_navi", "sit_sofa")
-    """Tasks of the closed loops: the experts walk, and sit down."""
+    loops: Several[str] = ("vis_navi", "sit_sofa", "football")
+    """Tasks of closed loops and replays: the experts walk, sit down, and kick."""

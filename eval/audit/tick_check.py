@@ -37,7 +37,7 @@ class TickDifferences:
     positions: list[np.ndarray] = field(default_factory=list)
     """Differences of all bodies after each tick [m], each of shape [bodies, 3]."""
     velocities: list[np.ndarray] = field(default_factory=list)
-    """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; of the last state they are not recorded."""
+    """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; the last state has none."""
 
     def of_ticks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest difference of a position and of a velocity after each tick."""

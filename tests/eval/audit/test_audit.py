@@ -176,7 +176,7 @@ class Losing(FakeEnv):
         return np.where(status == codes.SUCCESS, codes.FALL, status)
 
 
-def test_another_policys_actions_are_found(honest, capsys):
+def test_actions_of_another_policy_are_found(honest, capsys):
     """The policy is asked again at its own queries: the run's own decides as recorded, another one is found."""
     asked = ["audit", str(honest / "run"), "--replay", "6", "--draw", "7", "--policy", "stand"]
     assert main(asked, factories()) == 0
