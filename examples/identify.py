@@ -45,7 +45,7 @@ class Late:
         return torch.lerp(newer, older, self.ticks % 1.0)
 
 
-def recorded(truth: torch.Tensor, ticks: int, noise: torch.Tensor) -> differentiable.Recorded:
+def recorded(truth: torch.Tensor, ticks: int, noise: torch.Tensor) -> differentiable.RobotRecording:
     """A walk of the other robot from its third second on, as its sensors see it."""
     late, states = Late(trackers.get("twist2"), float(truth[-1])), list[differentiable.EngineState]()
     tracker = cast(trackers.Tracker, late)  # by `__getattr__`
@@ -70,7 +70,7 @@ def recorded(truth: torch.Tensor, ticks: int, noise: torch.Tensor) -> differenti
         mujoco.mj_integratePos(model, row, error.copy(), 1.0)
     targets = torch.from_numpy(env.physics.ctrl.numpy()).double().repeat(ticks - 1, 1)
     targets[:, env.scene.robot.joint_ctrl] = torch.cat(late.sent[1 - ticks :]).double()
-    return differentiable.Recorded(qpos, qvel + errors[1], targets, noise)
+    return differentiable.RobotRecording(qpos, qvel + errors[1], targets, noise)
 
 
 def main() -> None:

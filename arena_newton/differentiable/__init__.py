@@ -14,7 +14,7 @@ from arena_newton.differentiable.estimates import (
     play,
     reach,
 )
-from arena_newton.differentiable.identification import Fit, Recorded, Windows
+from arena_newton.differentiable.identification import FactorFit, RobotRecording, Windows
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 from arena_newton.differentiable.soft_onset import soft_onset
@@ -23,10 +23,10 @@ __all__ = [
     "Differences",
     "EngineState",
     "EngineStep",
-    "Fit",
+    "FactorFit",
     "Played",
     "Reach",
-    "Recorded",
+    "RobotRecording",
     "ReferenceState",
     "Rolled",
     "RollingBall",

@@ -1,4 +1,4 @@
-"""Which robot it is: factors of a model and a latency, fitted to a recording by least squares in short windows.
+"""Identification of a robot: factors of a model and a latency, fitted to a recording by least squares in short windows.
 
 A window starts from a measured state and replays the recorded targets in the engine, so that no tracker is needed and
 no error grows. States are measured with noise, and 1 mm decides whether a foot touches; so each window's own start is
@@ -19,13 +19,13 @@ from arena_newton.differentiable.engine_step import EngineState, EngineStep
 from arena_newton.errors import InputError
 from arena_newton.physics.batch import Physics
 
-__all__ = ["Fit", "Recorded", "Windows"]
+__all__ = ["FactorFit", "RobotRecording", "Windows"]
 
 _OUTLIER = 3.0
 """Standard deviations from which on a residual counts linearly (Huber): one contact missed rules no fit."""
 
 
-class Recorded(NamedTuple):
+class RobotRecording(NamedTuple):
     """A recording of a robot, float64."""
 
     qpos: torch.Tensor
@@ -39,7 +39,7 @@ class Recorded(NamedTuple):
     measured, shape [2 nv]."""
 
 
-class Fit(NamedTuple):
+class FactorFit(NamedTuple):
     """A step of a fit."""
 
     numbers: torch.Tensor
@@ -58,7 +58,7 @@ class Windows:
     """Short windows of a recording, one per world of a physics."""
 
     def __init__(
-        self, physics: Physics, recorded: Recorded, parameters: Sequence[str], *, ticks: int = 10, first: int = 3
+        self, physics: Physics, recorded: RobotRecording, parameters: Sequence[str], *, ticks: int = 10, first: int = 3
     ):
         """Cut the windows, one behind the other.
 
@@ -82,7 +82,7 @@ class Windows:
         self._recorded, self._ticks, self._scale = recorded, ticks, 1.0 / recorded.noise[self._seen]
 
     def residuals(self, numbers: torch.Tensor, moves: torch.Tensor | None = None) -> torch.Tensor:
-        """What measurements differ from the model, in standard deviations, shape [windows, numbers of a window].
+        """Differences of the model from the measurements, in standard deviations, shape [windows, numbers of a window].
 
         Args:
             numbers: Logarithms of the factors, then the latency [ticks].
@@ -91,12 +91,12 @@ class Windows:
         return self._played(numbers, moves)[0]
 
     def misfit(self, numbers: torch.Tensor) -> float:
-        """What `fit` minimises, per number, with starts as measured: for a search without gradients."""
+        """Loss that `fit` minimises, per number, with starts as measured: for a search without gradients."""
         return float(_loss(self.residuals(numbers)).mean())
 
     def fit(
         self, numbers: torch.Tensor, spread: torch.Tensor, *, iterations: int = 20, starts: bool = True
-    ) -> Iterator[Fit]:
+    ) -> Iterator[FactorFit]:
         """Fit until a step gains less than a hundredth.
 
         Starts that settled while the numbers were wrong may keep a contact that was none; where more than noise is
@@ -127,7 +127,7 @@ class Windows:
         iterations: int,
         starts: bool,
         moves: torch.Tensor | None = None,
-    ) -> Iterator[Fit]:
+    ) -> Iterator[FactorFit]:
         guess, damping = numbers, 1.0
         moves = numbers.new_zeros(len(self._begin), 2 * self._model.nv) if moves is None else moves
         for _ in range(iterations):
@@ -165,7 +165,7 @@ class Windows:
                 return
             numbers, moves, damping = tried, moved, max(damping / 4.0, 1e-4)
             free = after.numel() - len(numbers) - by_start.shape[0] * by_start.shape[2]
-            yield Fit(numbers, float(_loss(after).sum()) / free, information, moves)
+            yield FactorFit(numbers, float(_loss(after).sum()) / free, information, moves)
             if gained < 1e-2 * loss:
                 return
 

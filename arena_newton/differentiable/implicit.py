@@ -336,8 +336,8 @@ class ImplicitWorld:
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
         gain, bias, drive = m.actuator_gainprm[:, 0], m.actuator_biasprm, driven[:, self._dof]
-        np.add.at(at_q, (slice(None), self._dof), bias[:, 1] * drive)
-        np.add.at(at_v, (slice(None), self._dof), bias[:, 2] * drive)
+        np.add.at(at_q.T, self._dof, (bias[:, 1] * drive).T)
+        np.add.at(at_v.T, self._dof, (bias[:, 2] * drive).T)
         stiff = drive * (gain * targets + bias[:, 1] * step.q[self._qadr])
         damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[:, self._dof])
         return at_q, at_v, gain * drive, np.stack([stiff, damped]), y, w

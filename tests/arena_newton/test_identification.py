@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from arena_newton.differentiable import EngineStep, Recorded, Windows
+from arena_newton.differentiable import EngineStep, RobotRecording, Windows
 from arena_newton.errors import InputError
 from arena_newton.physics.scene import load_scene
 from tests.arena_newton.test_engine_step import stood
@@ -38,7 +38,7 @@ def recorded(physics):
     qvel[:, robot.joint_qvel] += 10.0 * NOISE * torch.randn(TICKS + 1, len(robot.joint_qvel), generator=draws).double()
     noise = torch.tensor([[NOISE], [10.0 * NOISE]], dtype=torch.float64).repeat(1, dofs)
     noise[:, physics.scene.joint_qvel("/World/Ball") :][:, :6] = torch.inf
-    return Recorded(qpos, qvel, sent, noise.flatten())
+    return RobotRecording(qpos, qvel, sent, noise.flatten())
 
 
 def test_all_slopes_of_a_tick_are_its_gradients(physics):
