@@ -79,6 +79,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the other robot, of the noise and of the search")
     parser.add_argument("--windows", type=int, default=10, help="windows of 10 ticks")
     parser.add_argument("--iterations", type=int, default=20, help="most steps of the fit")
+    parser.add_argument("--measured-starts", action="store_true", help="fit no starts, as the search does")
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
@@ -101,7 +102,7 @@ def main() -> None:
         return apart
 
     began = time.process_time()
-    for fit in windows.fit(guess, spread, iterations=args.iterations):
+    for fit in windows.fit(guess, spread, iterations=args.iterations, starts=not args.measured_starts):
         apart = told("fit", fit.numbers, fit.misfit)
     budget, wide = 3.0 * (time.process_time() - began), torch.linalg.inv(fit.information).diagonal().sqrt() / scale
     print("singular values:", *torch.linalg.eigvalsh(fit.information).sqrt().int().tolist())

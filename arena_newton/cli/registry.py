@@ -34,7 +34,7 @@ class Registry[T]:
             group: Entry-point group under which other packages offer theirs.
             base: Gives the class that everything made must be of.
             built_in: Name to `module:attribute` of a maker.
-            named: Whether what is made has a `name`, which must be the one it is known by.
+            named: What is made has a `name`, which must be the one it is known by.
         """
         self.noun, self.group, self.base, self.built_in, self.named = noun, group, base, built_in, named
         self._registered: dict[str, Callable[..., T] | T] = {}

@@ -141,6 +141,12 @@ def other_environment(folder: Path, lines: list[Line]) -> None:
         line["hashes"]["environment"] = config_hash(comparable(facts))
 
 
+def other_code_and_environment(folder: Path, lines: list[Line]) -> None:
+    """The same, with the hash of another version's code to explain it."""
+    claimed(config__code="0" * 12)(folder, lines)
+    other_environment(folder, lines)
+
+
 def other_drive(folder: Path, lines: list[Line]) -> None:
     """Other gains of the joints, in configuration and flags alike."""
     claimed(config__drive="humanoidarena", options__drive="humanoidarena")(folder, lines)
@@ -326,6 +332,7 @@ FORGERIES: dict[str, Forgery] = TABLES | {
     "a variant that was not played": claimed(config__variant="0" * 12),
     "weights of trackers, with all hashes": other_weights,
     "an environment, with its hash": other_environment,
+    "code and an environment, with all hashes": other_code_and_environment,
     "signals of a failure": other_signals,
     "the worst group seed left out of the plan": seed_dropped,
     "weights of the policy, with all hashes": claimed(config__policy_file="0" * 12, of_lines=other_policy_file),

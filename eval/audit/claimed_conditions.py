@@ -21,6 +21,8 @@ DESCRIBED = "tracker_facts mode_facts foreign_tasks".split()
 """Keys that say what code is: they may differ where that is another version's."""
 ELSEWHERE = ("device", "tracker", "recorders")
 """Facts of an environment that depend on the machine, or on the programs that are here."""
+RATES = ("physics_dt", "substeps", "startup_ticks")
+"""Facts of an environment that no other version of the code explains: without them no replay gives the same bits."""
 ROUNDED = 2e-4
 """Largest difference of a signal, which a line holds with four digits."""
 
@@ -65,7 +67,8 @@ def hold_environment(audit: Audit, config: RunConfig, group: str, env: World) ->
     claimed = audit.run.document.get("environments", {}).get(group, {})
     facts = plain_facts(env.describe())
     for key, was, now in _differing(claimed, facts, [key for key in claimed if key in facts]):
-        if key in ELSEWHERE or audit.run.config.get("code") != config.code_hash:
+        same = audit.run.config.get("code") == config.code_hash
+        if key in ELSEWHERE or not (same or key in RATES):
             note_difference(audit, f"{key} of {group}")
         else:
             where = f"{audit.run.folder / CONFIG_FILE}: environments: {group}: {key}"

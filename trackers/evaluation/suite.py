@@ -78,7 +78,8 @@ class Blows:
     seconds: float = 0.08
     """Duration [s]."""
     ramp: bool = False
-    """Draw each from half of a bound to the bound, which climbs from a third of `newtons` to `newtons` over all."""
+    """Draw each from half of a bound to the bound, which climbs in equal steps from a third of `newtons`, and would be
+    `newtons` at one blow more."""
 
 
 @dataclass(frozen=True)

@@ -128,6 +128,7 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
 REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
 REPLAYED |= {"a failure made a success", "every failure made a success", "a success under the seed of a failure"}
 REPLAYED |= {"weights of trackers, with all hashes", "an environment, with its hash"}
+REPLAYED |= {"code and an environment, with all hashes"}
 REPLAYED |= {"a run of an older version, and a margin"}
 LEVEL = dict.fromkeys(REPLAYED, "replay")
 LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
