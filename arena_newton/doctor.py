@@ -27,7 +27,7 @@ USAGE = """usage: arena-newton doctor
 
 Examines packages, extras, devices, engines, kernel cache, disk and scenes, and says what to do about what is missing.
 With --tracker or --policy it tries what the interface promises on one of them, a package's own included; these are
-short for `trackers check` and `policies check`. With --stand the tracker also stands and turns for two seconds.
+short for `trackers check` and `policies check`. With --stand the tracker also stands, turns and walks for two seconds.
 Exit code 0: a run can start, every promise is kept; 1: a problem must be solved first; 2: bad input."""
 _REQUIRED = {
     "newton": "physics, scenes and cameras",

@@ -15,13 +15,17 @@ from arena_newton.cli.extras import require
 from arena_newton.cli.flags import parse_flags
 from arena_newton.errors import InputError
 from benchmarks.bench_options import (
+    AuditTimeOptions,
     CameraBenchOptions,
     DatasetBenchOptions,
+    DeviceOptions,
     ForgeryOptions,
     GradientBenchOptions,
+    HonestOptions,
     PeerOptions,
     PlainBenchOptions,
     PolicyBenchOptions,
+    ProcessorOptions,
     RecordingBenchOptions,
     RoundsBenchOptions,
     ServerBenchOptions,
@@ -64,7 +68,11 @@ BENCHES = {
     "episodes": Item(PlainBenchOptions, "single_figures:episode_times", "60 Football episodes on two cores"),
     "gradients": Item(GradientBenchOptions, "gradient_bench:slope_figures", "exact slopes against finite differences"),
     "overview": Item(PlainBenchOptions, "single_figures:overview_times", "python -m arena_newton.eval --help"),
-    "forgeries": Item(ForgeryOptions, "forgeries:forgery_figures", "forged results, and what finds each"),
+    "forgeries": Item(ForgeryOptions, "audits.forgeries:forgery_figures", "forged results, and what finds each"),
+    "audit": Item(AuditTimeOptions, "audits.audit_times:audit_times", "duration of an audit"),
+    "processors": Item(ProcessorOptions, "audits.processors:processor_figures", "replays with other instructions"),
+    "devices": Item(DeviceOptions, "audits.device_ticks:device_figures", "ticks and pictures of engine warp, replayed"),
+    "honest": Item(HonestOptions, "audits.honest_folders:honest_figures", "honest results that an audit accuses: none"),
     "tests": Item(PlainBenchOptions, "single_figures:suite_times", "the test suite, kernels cached and not"),
 }
 """Benches by name."""

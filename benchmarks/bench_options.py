@@ -13,6 +13,10 @@ __all__ = [
     "DatasetBenchOptions",
     "ForgeryOptions",
     "GradientBenchOptions",
+    "AuditTimeOptions",
+    "DeviceOptions",
+    "HonestOptions",
+    "ProcessorOptions",
     "PeerOptions",
     "PlainBenchOptions",
     "PolicyBenchOptions",
@@ -178,7 +182,7 @@ class PeerOptions(PlainBenchOptions):
 
 @dataclass(frozen=True)
 class ForgeryOptions(PlainBenchOptions):
-    """Forge a results folder in fifty ways, and say at which level `eval audit` finds each."""
+    """Forge a results folder in some seventy ways, and say at which level `eval audit` finds each."""
 
     folder: str = ""
     """Honest folder of a run on engine mujoco; copies are forged."""
@@ -187,14 +191,63 @@ class ForgeryOptions(PlainBenchOptions):
 
 
 @dataclass(frozen=True)
+class AuditTimeOptions(PlainBenchOptions):
+    """Measure how long an audit takes, and say how probably it finds a forged line."""
+
+    folder: str = ""
+    """Honest folder of a run on engine mujoco."""
+    replay: int = 60
+    """Episodes that are played again; 0: none."""
+
+
+@dataclass(frozen=True)
+class ProcessorOptions(PlainBenchOptions):
+    """Replay a folder with other vector instructions and numbers of threads than the run's, and say what changes."""
+
+    folder: str = ""
+    """Honest folder of a run on engine mujoco; all of its episodes are played again in each row."""
+    policy: str | None = None
+    """Policy of the folder, to be asked again."""
+
+
+@dataclass(frozen=True)
+class DeviceOptions(PlainBenchOptions):
+    """Record experts on engine warp, and measure what an audit on engine mujoco allows for: ticks and pictures."""
+
+    device: Device[str] = "cpu"
+    """Device of engine warp: cuda:0, or cpu, which takes minutes."""
+    tasks: Several[str] = ("football", "pp_box")
+    """Tasks."""
+    episodes: int = field(default=2, metadata=bounds(1, 10_000))
+    """Episodes of each."""
+    max_steps: int | None = None
+    """Cap on their step budget [ticks]."""
+
+
+@dataclass(frozen=True)
+class HonestOptions(PlainBenchOptions):
+    """Play honest folders of many kinds, each a run of its own, and count those that an audit accuses."""
+
+    count: int = field(default=500, metadata=bounds(1, 100_000))
+    """Folders."""
+    replay_every: int = field(default=3, metadata=bounds(1, 100_000))
+    """Folders of which one has two episodes played again too."""
+    seed: int = 0
+    """Number by which kinds and flags are drawn."""
+
+
+@dataclass(frozen=True)
 class GradientBenchOptions(PlainBenchOptions):
     """Compare exact slopes of engine mujoco with finite differences, in states of the experts' episodes."""
 
+    what: tuple[str, ...] = ("all",)
+    """Figures: ticks, closed loops, replay of whole episodes, reach of slopes through a kick, featherstone (Newton's
+    solver with its tape, on CUDA where there is one), or `all`."""
     tasks: Several[str] = ()
     """Tasks; all that have an expert when none are named."""
     trackers: Several[str] = QUICK_TRACKERS
     """Trackers, whose drives differ."""
     states: int = field(default=20, metadata=bounds(2, 10_000))
     """States of each task and tracker."""
-    loops: Several[str] = ("vis_navi", "sit_sofa")
-    """Tasks of the closed loops: the experts walk, and sit down."""
+    loops: Several[str] = ("vis_navi", "sit_sofa", "football")
+    """Tasks of closed loops and replays: the experts walk, sit down, and kick."""

@@ -1,21 +1,31 @@
-"""Exact slopes of engine `mujoco` next to finite differences: ticks and closed loops of the experts' episodes."""
+"""Exact slopes of engine `mujoco` next to finite differences: ticks and closed loops of the experts' episodes.
+
+Beside them: a loop next to the episode that it replays, and how far slopes through a kick reach.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import torch
 
 from arena_newton import policies, tasks, trackers
-from arena_newton.differentiable import closed_loop, reset_state
+from arena_newton.differentiable import Rolled, closed_loop, reach, reset_state, soft_onset
 from arena_newton.env import ArenaEnv
-from arena_newton.eval.bench.timing import BenchFigure
+from arena_newton.errors import InputError
+from arena_newton.eval.bench.timing import BenchFigure, Figures, chosen
 from arena_newton.eval.certification.checks.gradients import TICK_STEPS, Slopes, TickSlopes
+from arena_newton.interfaces import Recorder, World
+from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from benchmarks.bench_options import GradientBenchOptions
+from benchmarks.featherstone_bench import featherstone_figures
 
 __all__ = ["slope_figures"]
 
@@ -30,6 +40,23 @@ EVERY = 30
 
 LOOPS = {10: 1e-3, 50: 1e-2, 200: 1e-2}
 """Lengths of closed loops [ticks], and the largest relative error of a slope at each."""
+KICKS = ("football",)
+"""Tasks of which a loop until the touch is measured, too."""
+LONGEST = 600
+"""Ticks of an episode, at most."""
+TOUCHED = 0.1
+"""Horizontal speed that tells a touch of what lies [m/s]."""
+LONGEST_KICK = 400
+"""Ticks within which the kick happens whose reach is measured."""
+BEHIND = 25
+"""Ticks from the kick to the ball's place that is differentiated."""
+SPED = 50
+"""Ticks before the touch in which the robot is sped up."""
+REACH_SCALES = (1e-3, 1e-2)
+"""Scales of the ball's start [m] and of the speed [m/s]."""
+MOVED = ("its start x", "its start y", "the kick's speed")
+REPLAY_BAR = 1e-4
+"""Largest distance of a loop from the episode that it replays [m, rad]."""
 FACTORS = ("friction", "mass", "mass:/World/Robot/torso_link", "kp", "kd")
 FACTOR_TICKS = 100
 STEP = 1e-6
@@ -37,15 +64,35 @@ STEP = 1e-6
 
 
 def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
-    """Ticks by task and tracker, then closed loops of the experts, against differences of a converged solver."""
-    for tracker in options.trackers:
-        for task in options.tasks or tasks.names():
-            yield _tick(task, tracker, options.states)
-    for tracker in options.trackers:
-        for task in options.loops:
-            for ticks, bar in LOOPS.items():
-                yield _loop(task, tracker, ticks, bar)
-            yield _loop(task, tracker, FACTOR_TICKS, 1e-2, FACTORS)
+    """Figures that `--what` names, by tracker and task; differences are those of a converged solver."""
+    every = options.tasks or tasks.names()
+    items: dict[str, Figures] = {
+        "ticks": lambda: (_tick(task, tracker, options.states) for tracker in options.trackers for task in every),
+        "loops": lambda: (
+            _loop(task, tracker, ticks, bar, factors)
+            for tracker in options.trackers
+            for task in options.loops
+            for ticks, bar, factors in _lengths(task)
+        ),
+        "replay": lambda: (_replay(task, tracker) for tracker in options.trackers for task in options.loops),
+        "reach": reach_figures,
+        "featherstone": featherstone_figures,
+    }
+    for figures in chosen(options.what, items).values():
+        yield from figures()
+
+
+def _lengths(task: str) -> Iterator[tuple[int | None, float, Sequence[str]]]:
+    """Length of each closed loop, None until the touch, with its bar and its factors of the model."""
+    yield from ((ticks, bar, ()) for ticks, bar in LOOPS.items())
+    if task in KICKS:
+        yield None, 1e-2, ()
+    yield FACTOR_TICKS, 1e-2, FACTORS
+
+
+def _world(task: str, tracker: str) -> ArenaEnv:
+    follows = trackers.get(tracker)
+    return ArenaEnv(task, tracker=follows, worlds=1, engine="mujoco", rules="released", fast_physics=True)
 
 
 def _tick(task: str, tracker: str, states: int) -> BenchFigure:
@@ -72,16 +119,18 @@ def _apart(slopes: Slopes) -> float:
     return 1.0 - float(torch.nn.functional.cosine_similarity(exact, estimated, dim=0))
 
 
-def _loop(task: str, tracker: str, ticks: int, bar: float, factors: Sequence[str] = ()) -> BenchFigure:
+def _loop(task: str, tracker: str, ticks: int | None, bar: float, factors: Sequence[str] = ()) -> BenchFigure:
     """Largest relative error of slopes of the pelvis' last position to actions, start and speeds, or to factors."""
-    name = f"relative error over {ticks} ticks, {task} through {tracker}{', factors' if factors else ''}"
-    env = ArenaEnv(task, tracker=trackers.get(tracker), worlds=1, engine="mujoco", rules="released", fast_physics=True)
+    env = _world(task, tracker)
     for model in env.physics.models:
         model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 100
     robot, seeds = env.scene.robot, [seeding.episode_seed(tasks.get(task).gym_id, 0, 0)]
     start, draws = reset_state(env, seeds), torch.Generator().manual_seed(0)
     with torch.no_grad():
-        actions = closed_loop(env, policies.get("expert"), seeds, ticks).actions.transpose(0, 1)
+        rolled = closed_loop(env, policies.get("expert"), seeds, LONGEST if ticks is None else ticks)
+    length = "until the touch" if ticks is None else f"over {ticks} ticks"
+    ticks = touch_of(env, rolled) - 1 if ticks is None else ticks
+    actions = rolled.actions[:ticks].transpose(0, 1)
     weights = torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
 
     def number(actions: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor, given: torch.Tensor) -> torch.Tensor:
@@ -110,5 +159,88 @@ def _loop(task: str, tracker: str, ticks: int, bar: float, factors: Sequence[str
         slope = float((gradients[part] * direction).sum())
         errors[which] = abs(slope - estimated) / max(abs(estimated), 1e-9)
     env.close()
-    note = ", ".join(f"{which} {error:.0e}" for which, error in errors.items())
+    name = f"relative error {length}, {task} through {tracker}{', factors' if factors else ''}"
+    note = f"{ticks} ticks; " + ", ".join(f"{which} {error:.0e}" for which, error in errors.items())
     return BenchFigure(name, bar, "", True, max(errors.values()), note)
+
+
+def touch_of(env: ArenaEnv, rolled: Rolled) -> int:
+    """The tick after which the thing that lay moves, in the first world."""
+    address = env.scene.joint_qvel(env.spec.target)
+    moves = rolled.qvel[:, 0, address : address + 2].norm(dim=1) > TOUCHED
+    if not moves.any():
+        raise InputError(f"{env.spec.name}: the expert touches nothing within {len(moves) - 1} ticks")
+    return int(moves.int().argmax())
+
+
+class _Path(Recorder):
+    """Positions and actions of the episode in the first world."""
+
+    def __init__(self) -> None:
+        self.qpos: list[np.ndarray] = []
+        self.actions: list[torch.Tensor] = []
+
+    def tick(self, env: World) -> None:
+        if env.active[0] and env.tick[0] >= 0:
+            world = cast("ArenaEnv", env)
+            self.qpos.append(cast("MujocoPhysics", world.physics).data[0].qpos.copy())
+            self.actions.append(world.loop.action[0].clone())
+
+
+def _replay(task: str, tracker: str) -> BenchFigure:
+    """Largest distance of a closed loop from the expert's whole episode, whose actions it repeats."""
+    env = _world(task, tracker)
+    seed, path = seeding.episode_seed(tasks.get(task).gym_id, 0, 0), _Path()
+    episodes = [SimpleNamespace(episode_seed=seed)]
+    Rollout(env, policies.get("expert"), episodes, recorder=path, max_steps=LONGEST).run()
+    with torch.no_grad():
+        rolled = closed_loop(env, torch.stack(path.actions).double()[None], [seed], len(path.actions))
+    apart = (rolled.qpos[1:, 0] - torch.from_numpy(np.stack(path.qpos))).abs()
+    root = env.scene.robot.root_qpos
+    note = f"{len(apart)} ticks; pelvis {float(apart[:, root : root + 3].max()):.0e} m"
+    if task in KICKS:
+        note += f"; the ball, touched after {touch_of(env, rolled)}, "
+        note += f"{float(apart[:, env.scene.joint_qpos(env.spec.target) :][:, :3].max()):.0e} m"
+    env.close()
+    name = f"distance from the replayed episode, {task} through {tracker}"
+    return BenchFigure(name, REPLAY_BAR, "m, rad", True, float(apart.max()), note)
+
+
+def reach_figures() -> Iterator[BenchFigure]:
+    """Slopes of the ball's path behind a kick to where it starts and to the speed of the kick, beside differences.
+
+    With contacts as they are, and with those of `soft_onset`; of these all three are to hold.
+    """
+    for soft in (False, True):
+        env = _world("football", "twist2")
+        seeds = [seeding.episode_seed(env.spec.gym_id, 0, 0)]
+        with torch.no_grad():
+            rolled = closed_loop(env, policies.get("expert"), seeds, LONGEST_KICK)
+        touch = touch_of(env, rolled)
+        actions = rolled.actions[: touch + BEHIND].transpose(0, 1)
+        if soft:
+            soft_onset(env, env.spec.target)
+        yield _reach(env, seeds, actions, touch, soft)
+        env.close()
+
+
+def _reach(env: ArenaEnv, seeds: Sequence[int], actions: torch.Tensor, touch: int, soft: bool) -> BenchFigure:
+    """Number of the slopes that hold."""
+    start, ball = reset_state(env, seeds), env.scene.joint_qpos(env.spec.target)
+    faster = torch.zeros_like(actions)
+    faster[:, touch - SPED : touch, 0] = TICK
+
+    def end(points: torch.Tensor) -> torch.Tensor:
+        qpos = start.qpos.index_add(1, torch.tensor([ball, ball + 1]), points[:, :2])
+        plan, moved = actions + points[0, 2] * faster, start._replace(qpos=qpos)
+        rolled = closed_loop(env, plan, seeds, plan.shape[1], start=moved, checkpoint=25)
+        return rolled.qpos[-1, :, ball + 1]
+
+    at = torch.zeros(3, dtype=torch.float64)
+    leaf = at.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(end(leaf[None])[0], leaf)
+    found = reach(end, at, slope, REACH_SCALES, rows=1)
+    rows = zip(MOVED, *(part.tolist() for part in found), strict=True)
+    note = "; ".join(f"{name} {exact:+.2f} ({near:+.2f}, {far:+.2f})" for name, exact, near, far, _ in rows)
+    name = f"slopes through a kick that hold over 1 cm, {'soft onset' if soft else 'contacts as they are'}"
+    return BenchFigure(name, 3.0 if soft else None, "of 3", False, float(found.holds.sum()), note)

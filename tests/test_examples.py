@@ -18,14 +18,16 @@ from arena_newton.eval.__main__ import main
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
-LONGER = {"word_agent": 123}
-"""Example of more lines → their number: eyes, memory, decision and protocol of a whole agent."""
+LONGER = {"finetune": 145, "fit_motion": 65, "identify": 120, "slopes": 75, "word_agent": 123}
+"""Example of more lines → their number: three methods, or a method and its peer, on one problem; a whole agent."""
 RUN = "--task boxing --tracker twist2 --seeds 0 --repeats 1 --engine mujoco --max-steps 4 --out OUT".split()
 SHORT: dict[str, list[str]] = {
     "aim_a_kick": ["--kick", "7.34", "6.03", "--max-steps", "20"],
     "compare_runs": ["--max-steps", "4", "--out", "OUT"],
     "drive_by_code": ["--max-steps", "55"],
+    "finetune": ["--seconds", "0.1", "--max-steps", "4"],
     "fit_motion": ["--iterations", "2", "--plays", "2", "--max-steps", "6"],
+    "identify": ["--windows", "2", "--iterations", "1"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
@@ -33,6 +35,7 @@ SHORT: dict[str, list[str]] = {
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "refine_reference": ["--max-steps", "4", "--rounds", "2"],
     "research": [*RUN, "--policy", "stand"],
+    "slopes": ["--max-steps", "4", "--points", "3"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
     "word_agent": ["--seeds", "0", "--repeats", "1", "--max-steps", "110", "--out", "OUT"],
     "worst_start": ["--max-steps", "2", "--iterations", "1"],
@@ -43,7 +46,9 @@ SAYS = {
     "aim_a_kick": r" margin \+0.0\d+ m\n(.*\n)?.*  margin \+0.1\d+ m\nin the engine: margin \+0.\d+ m, .* cm apart",
     "compare_runs": r"expert: 0 of 4, 0 that the other loses\n.*stand: 0 of 4.*\nprobability .* by luck: 1\n",
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
+    "finetune": r"(gradient  error 0\.\d+ rad .*\n){2,}(PPO .* s\n){2,}(ES .* s\n){2,}",
     "fit_motion": r"(gradient  misfit 0\.\d+ .* s\n){2}(CEM       misfit \d\.\d+ .* s\n)+",
+    "identify": r"(fit  misfit .*\n)+singular values:( \d+){18}\n(.* standard error .* %\n){18}(CEM  misfit .* s\n)+",
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
@@ -51,6 +56,7 @@ SAYS = {
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
+    "slopes": r"speed .*: exact slope .*\nball's start .*: exact slope [+-]\d\.\d+, of the line .*\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",
     "word_agent": r"policy process:python word_agent.py answer, (.*\n)*1 episode, this run took",
     "worst_start": r"moved \+0.00 \+0.00 m  margin -\d.\d+ m  holds .*\nby gradient: .*\nby cross-entropy: .* s\n",

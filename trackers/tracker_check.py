@@ -30,7 +30,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--checkpoint", default=None, metavar="PATH", help="its weights, where it comes without")
     add("--worlds", type=int, default=3, metavar="N", help="worlds in the larger batch (3)")
     add("--device", default="cpu", help="cpu, cuda or cuda:N (cpu)")
-    add("--stand", action="store_true", help="also stand and turn for two seconds in the lab: signs, frames, scales")
+    add(
+        "--stand",
+        action="store_true",
+        help="also stand, turn and walk for two seconds in the lab: signs, frames, scales",
+    )
     return parser
 
 

@@ -14,6 +14,7 @@ from arena_newton.differentiable.estimates import (
     play,
     reach,
 )
+from arena_newton.differentiable.identification import Fit, Recorded, Windows
 from arena_newton.differentiable.kernel_gradients import ReferenceState, reference_step, success_margin
 from arena_newton.differentiable.rolling_ball import RollingBall, ball_flight
 from arena_newton.differentiable.soft_onset import soft_onset
@@ -22,11 +23,14 @@ __all__ = [
     "Differences",
     "EngineState",
     "EngineStep",
+    "Fit",
     "Played",
     "Reach",
+    "Recorded",
     "ReferenceState",
     "Rolled",
     "RollingBall",
+    "Windows",
     "ball_flight",
     "central_differences",
     "closed_loop",

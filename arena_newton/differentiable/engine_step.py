@@ -47,7 +47,8 @@ class EngineStep:
         Args:
             physics: Worlds of engine `mujoco`; they are read, never stepped.
             parameters: Factors of the model that a tick takes: `mass` (with inertia), `friction`, `kp`, `kd` scale
-                those of all bodies, geoms or drives, `mass:PRIM` and so on those at or under a prim.
+                those of all bodies, geoms or drives, `mass:PRIM` and so on those at or under a prim, or under several
+                with commas between them.
             converged: Let the solver go on until nothing changes, for finite differences: the engine's own stops at a
                 tolerance, next to where it stopped in the tick before, and so ignores small changes.
 
@@ -100,6 +101,23 @@ class EngineStep:
                 raise InputError(f"EngineStep: {name} of shape {list(tensor.shape)}, not {[len(self._worlds), width]}")
         return EngineState(*_Tick.apply(self, *(tensor.cpu().double() for tensor in given)))
 
+    def jacobian(
+        self, state: EngineState, targets: torch.Tensor, factors: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """All slopes of a tick, for little more than one gradient's time.
+
+        Args:
+            state: As a tick takes it.
+            targets: As a tick takes them.
+            factors: As a tick takes them.
+
+        Returns:
+            Slopes of the state after the tick to that before it, shape [worlds, 2 nv, 2 nv], to targets and to factors.
+            A state here is its nv tangent positions, then its nv velocities.
+        """
+        by_state, by_targets, by_factors = self.stacked(ImplicitWorld.jacobian, _rows((*state, targets, factors)))
+        return by_state, by_targets, by_factors
+
     @property
     def data(self) -> list[mujoco.MjData]:
         """MuJoCo's data of each world as the last tick forward left it, contact forces included."""
@@ -138,4 +156,4 @@ class _Tick(torch.autograd.Function):
 
 def _rows(given: Sequence[torch.Tensor]) -> list[Inputs]:
     """Arguments of each world's tick."""
-    return [Inputs(*row) for row in zip(*(tensor.numpy() for tensor in given), strict=True)]
+    return [Inputs(*row) for row in zip(*(tensor.detach().numpy() for tensor in given), strict=True)]

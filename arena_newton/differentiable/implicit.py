@@ -27,8 +27,9 @@ __all__ = ["ImplicitWorld", "Inputs", "check", "scaled"]
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 """State of a constraint that acts."""
-_STEP = 1e-7
-"""Step of the differences of inverse dynamics in positions [m, rad]: a contact stiffens within 1 mm."""
+_STEP = 3e-9
+"""Step of the differences of inverse dynamics in positions [m, rad]. They are one-sided and a contact stiffens within
+1 mm, so that their error is in proportion: 1e-4 of a slope at 1e-7; that of rounding is below 1e-6 here."""
 _FACTOR_STEP = 1e-6
 """Step of the differences of inverse dynamics in a factor of the model."""
 _AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
@@ -81,22 +82,23 @@ def check(m: mujoco.MjModel) -> None:
 
 
 def scaled(name: str, scene: Scene) -> Scaled:
-    """Numbers of the scene's model that a parameter scales: `mass`, `friction`, `kp` or `kd`, or `mass:PRIM` and so on.
+    """Numbers of the scene's model that a parameter scales: `mass`, `friction`, `kp`, `kd`, `mass:PRIM,PRIM` and so on.
 
     Raises:
         InputError: Another name, or a prim without bodies, geoms or driven joints.
     """
     kind, _, prim = name.partition(":")
-    m = scene.mj_model
+    m, prims = scene.mj_model, prim.split(",")
 
     def under(paths: dict[str, int]) -> list[int]:
-        return [index for path, index in paths.items() if not prim or path == prim or path.startswith(f"{prim}/")]
+        found = [index for path, index in paths.items() for one in prims if path == one or path.startswith(f"{one}/")]
+        return found if prim else list(paths.values())
 
     if kind == "mass":
         rows = under(scene.body_ids)
         found: Scaled = [("body_mass", rows), ("body_inertia", rows)]
     elif kind == "friction":
-        rows = scene.geom_ids(prim) if prim else list(range(m.ngeom))
+        rows = [geom for one in prims for geom in scene.geom_ids(one)] if prim else list(range(m.ngeom))
         found = [("geom_friction", (rows, 0))]
     elif kind in ("kp", "kd"):
         rows = np.flatnonzero(np.isin(m.actuator_trnid[:, 0], under(scene.joint_ids))).tolist()
@@ -189,31 +191,55 @@ class ImplicitWorld:
 
     def adjoint(self, given: Inputs, qpos: np.ndarray, qvel: np.ndarray) -> Inputs:
         """Gradient of a number to what a tick took, from its gradients to qpos and qvel after the tick."""
-        d, steps = self._data, []
         self._begin(given)
+        steps = self._steps()
+        at_q, at_v, at_targets, at_factors = self._pulled(
+            given, steps, self._tangent(self._data.qpos, qpos)[None], qvel[None]
+        )
+        return Inputs(
+            self._ambient(given.qpos, at_q[0]), at_v[0], np.zeros_like(given.carried), at_targets[0], at_factors[0]
+        )
+
+    def jacobian(self, given: Inputs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Slopes of tangent position and velocity after a tick to those before it, to targets and to factors.
+
+        Shapes [2 nv, 2 nv], [2 nv, nu] and [2 nv, factors].
+        """
+        self._begin(given)
+        rows = np.eye(2 * self._model.nv)
+        at_q, at_v, *rest = self._pulled(given, self._steps(), *np.hsplit(rows, 2))
+        return np.hstack([at_q, at_v]), rest[0], rest[1]
+
+    def _steps(self) -> list[_Substep]:
+        """The steps of a tick that has begun."""
+        d, steps = self._data, list[_Substep]()
         for _ in range(self._substeps):
             q, v = d.qpos.copy(), d.qvel.copy()
             mujoco.mj_step(self._model, d)
             steps.append(_Substep(q, v, d.qacc.copy(), d.qvel - v))
+        return steps
+
+    def _pulled(self, given: Inputs, steps: list[_Substep], at_q: np.ndarray, at_v: np.ndarray) -> list[np.ndarray]:
+        """Tangent gradients of some numbers to what a tick took, from those to its end, one row per number."""
         self._scale(self._inverse, given.factors)
-        at_q, at_v, at_targets = self._tangent(d.qpos, qpos), qvel, np.zeros_like(given.targets)
-        at_gains = np.zeros((2, len(at_targets)))
+        at_targets = np.zeros((len(at_q), len(given.targets)))
+        at_gains = np.zeros((2, *at_targets.shape))
         weighed: list[tuple[_Substep, np.ndarray, np.ndarray]] = []
         for step in reversed(steps):
             at_q, at_v, at_drives, by_gains, *weights = self._step_adjoint(step, given.targets, at_q, at_v)
             at_targets += at_drives
             at_gains += by_gains
             weighed.append((step, weights[0], weights[1]))
-        at_factors = np.empty_like(given.factors)
+        at_factors = np.empty((len(at_q), len(given.factors)))
         base = self._inertial(weighed, given.factors) if self._parameters else 0.0
         for k, ((field, index), *_) in enumerate(self._parameters):
             if field == "actuator_biasprm":
-                at_factors[k] = at_gains[index[1] - 1, index[0]].sum() / given.factors[k]
+                at_factors[:, k] = at_gains[index[1] - 1][:, index[0]].sum(axis=1) / given.factors[k]
                 continue
             moved = given.factors.copy()
             moved[k] += _FACTOR_STEP
-            at_factors[k] = (self._inertial(weighed, moved) - base) / _FACTOR_STEP
-        return Inputs(self._ambient(given.qpos, at_q), at_v, np.zeros_like(given.carried), at_targets, at_factors)
+            at_factors[:, k] = (self._inertial(weighed, moved) - base) / _FACTOR_STEP
+        return [at_q, at_v, at_targets, at_factors]
 
     def poses(self, qpos: np.ndarray, carried: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions [m] and orientations wxyz of the bodies, shapes [nbody, 3] and [nbody, 4]."""
@@ -280,19 +306,19 @@ class ImplicitWorld:
     def _step_adjoint(
         self, step: _Substep, targets: np.ndarray, at_q: np.ndarray, at_v: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Gradients to position, velocity, targets and gains at a step, and the weights of its two equations.
+        """Gradients to position, velocity, targets and gains at a step, and the weights of its two equations, in rows.
 
-        Those to gains are times the gains: of stiffness and of damping, shape [2, nu].
+        Those to gains are times the gains: of stiffness and of damping, shape [2, rows, nu].
         """
         m, d = self._inverse, self._data
-        h, nv = m.opt.timestep, m.nv
+        h = m.opt.timestep
         at_v, at_q = at_v + h * at_q, at_q.copy()
         for _, dof in self._quats:
             part = slice(dof, dof + 3)
             by_quat, by_vel = np.empty(9), np.empty(9)
             mujoco.mjd_quatIntegrate(step.v[part] + step.change[part], h, by_quat, by_vel, np.empty(3))
-            at_v[part] += h * (by_vel.reshape(3, 3).T @ at_q[part] - at_q[part])
-            at_q[part] = by_quat.reshape(3, 3).T @ at_q[part]
+            at_v[:, part] += h * (at_q[:, part] @ by_vel.reshape(3, 3) - at_q[:, part])
+            at_q[:, part] = at_q[:, part] @ by_quat.reshape(3, 3)
         m.opt.disableflags = self._flags
         d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
         mujoco.mj_inverse(m, d)
@@ -300,18 +326,20 @@ class ImplicitWorld:
         y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
         stiffness, constrained = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0), np.zeros_like(mass)
         mujoco.mju_sqrMatTD(constrained, jacobian, stiffness)
-        w = _solved(mass + constrained, mass @ y)
-        resisted = jacobian.T @ (stiffness * d.efc_KBIP[:, 1] * (jacobian @ w))
+        w = _solved(mass + constrained, y @ mass)
+        resisted = (stiffness * d.efc_KBIP[:, 1] * (w @ jacobian.T)) @ jacobian
         mujoco.mj_implicit(m, d)  # leaves qDeriv, and takes a step that nobody needs
-        at_v = at_v - resisted + np.bincount(columns, d.qDeriv * w[rows], nv)
+        rates = np.zeros_like(mass)
+        rates[rows, columns] = d.qDeriv
+        at_v = at_v - resisted + w @ rates
         at_q = at_q + self._by_position(step, y, w, jacobian != 0.0)
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
-        gain, bias, drive = m.actuator_gainprm[:, 0], m.actuator_biasprm, driven[self._dof]
-        at_q += np.bincount(self._dof, bias[:, 1] * drive, nv)
-        at_v += np.bincount(self._dof, bias[:, 2] * drive, nv)
+        gain, bias, drive = m.actuator_gainprm[:, 0], m.actuator_biasprm, driven[:, self._dof]
+        np.add.at(at_q, (slice(None), self._dof), bias[:, 1] * drive)
+        np.add.at(at_v, (slice(None), self._dof), bias[:, 2] * drive)
         stiff = drive * (gain * targets + bias[:, 1] * step.q[self._qadr])
-        damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[self._dof])
+        damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[:, self._dof])
         return at_q, at_v, gain * drive, np.stack([stiff, damped]), y, w
 
     def _jacobian(self) -> np.ndarray:
@@ -329,11 +357,11 @@ class ImplicitWorld:
 
         Args:
             step: It gives q, v, a and v' - v.
-            y: Weights of what the integrator equates to 0.
+            y: Weights of what the integrator equates to 0, in rows.
             w: Weights of what the solver equates to 0.
             moves: Which degree of freedom moves which constraint, shape [constraints, nv].
         """
-        m, d, found = self._inverse, self._data, np.empty(len(w))
+        m, d, found = self._inverse, self._data, np.empty_like(w)
         trees = np.eye(m.ntree)[m.dof_treeid]
         touched = moves @ trees
         joined = np.eye(m.ntree) + touched.T @ touched > 0.0
@@ -347,7 +375,7 @@ class ImplicitWorld:
             m.opt.disableflags = self._flags | island | flags
             at = np.flatnonzero(dofs)
             row = (groups[at].cumsum(axis=0) * groups[at]).sum(axis=1).astype(int)  # from 1 on in each group
-            directions = np.zeros((row.max(initial=0) + 1, len(w)))
+            directions = np.zeros((row.max(initial=0) + 1, m.nv))
             directions[row, at] = _STEP
             forces, inertial = np.empty_like(directions), np.empty_like(directions)
             for k, point in enumerate(step.q + self._ambient(step.q, directions, 0.5)):
@@ -355,21 +383,23 @@ class ImplicitWorld:
                 mujoco.mj_inverse(m, d)
                 mujoco.mj_mulM(m, d, inertial[k], rest)
                 forces[k] = force
-            sums = (y * inertial - w * forces) @ groups
-            found[at] = (groups[at] * (sums[row] - sums[0])).sum(axis=1) / _STEP
+            for group in groups.T[groups[at].any(axis=0)].astype(bool):
+                there = group[at]
+                sums = y[:, group] @ inertial[:, group].T - w[:, group] @ forces[:, group].T
+                found[:, at[there]] = (sums[:, row[there]] - sums[:, :1]) / _STEP
         return found
 
-    def _inertial(self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], factors: np.ndarray) -> float:
-        """Weighted sum of what integrator and solver equate to 0, drives aside; a gradient is its slope in a factor."""
+    def _inertial(self, weighed: Sequence[tuple[_Substep, np.ndarray, np.ndarray]], factors: np.ndarray) -> np.ndarray:
+        """Weighted sums of what integrator and solver equate to 0, drives aside; gradients are slopes in a factor."""
         m, d, product = self._inverse, self._data, np.empty(self._model.nv)
         m.opt.disableflags = self._flags
         self._scale(m, factors)
-        total = 0.0
+        total = np.zeros(len(weighed[0][1]))
         for step, y, w in weighed:
             d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
             mujoco.mj_inverse(m, d)
             mujoco.mj_mulM(m, d, product, step.a - step.change / m.opt.timestep)
-            total += float(y @ product - w @ d.qfrc_inverse)
+            total += y @ product - w @ d.qfrc_inverse
         return total
 
     def _tangent(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
@@ -396,9 +426,10 @@ class ImplicitWorld:
         return found
 
 
-def _solved(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Solution of a positive definite system, in one thread: those of LAPACK wait for each other; overwrites matrix."""
-    found = np.empty_like(vector)
+def _solved(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Solutions of a positive definite system, in one thread: LAPACK's wait for each other; overwrites matrix."""
+    found = np.empty_like(rows)
     mujoco.mju_cholFactor(matrix, 0.0)
-    mujoco.mju_cholSolve(found, matrix, vector)
+    for solution, row in zip(found, rows, strict=True):
+        mujoco.mju_cholSolve(solution, matrix, row)
     return found

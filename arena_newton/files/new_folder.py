@@ -99,7 +99,7 @@ def scratch_folder(out: Path, flag: str = "--out") -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[None]:
+def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[int]:
     """A folder, made where there is none and kept from other processes while the block lasts.
 
     Args:
@@ -107,16 +107,19 @@ def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[None]:
         doing: What another process does there, in the message: "trains in it".
         flag: What the message names.
 
+    Yields:
+        The open folder; a process that is handed it keeps the folder too, until it ends.
+
     Raises:
         InputError: Another process holds it, or it cannot be made.
     """
     with contextlib.ExitStack() as stack:
         try:
             out.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(held(out, f"{flag} {out}: another process {doing}"))
+            folder = stack.enter_context(held(out, f"{flag} {out}: another process {doing}"))
         except OSError as error:
             raise InputError(f"{flag} {out}: cannot be made ({error.strerror})") from None
-        yield
+        yield folder
 
 
 def link(source: Path, target: Path) -> None:

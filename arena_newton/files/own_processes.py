@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -14,6 +15,10 @@ __all__ = ["end", "environment", "how_it_ended", "start_module"]
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Set to 1 for a process that shares the cores with others: its libraries would start a thread per core."""
+
+PR_SET_PDEATHSIG = 1
+"""Request of Linux's `prctl`: a signal for the process when its parent ends."""
+_LIBC = ctypes.CDLL(None)  # found before a fork, after which no library is loaded
 
 
 def environment(*, one_thread: bool = False) -> dict[str, str]:
@@ -38,6 +43,7 @@ def start_module(
     output: int = subprocess.DEVNULL,
     errors: int | None = None,
     apart: bool = True,
+    tied: bool = False,
 ) -> subprocess.Popen[bytes]:
     """Start a module as a program.
 
@@ -49,6 +55,7 @@ def start_module(
         output: Where it writes: nowhere, or an open file; `subprocess.PIPE` stands for its input too, without buffers.
         errors: Where it writes errors, by default where this process does.
         apart: It is in a session of its own, as Ctrl-C is for whoever started it.
+        tied: It is told to end (SIGTERM) when this process is killed; of Linux only.
 
     Raises:
         OSError: The system lets no process start.
@@ -62,7 +69,14 @@ def start_module(
         stderr=errors,
         bufsize=0,
         start_new_session=apart,
+        preexec_fn=_end_with_parent if tied else None,
     )
+
+
+def _end_with_parent() -> None:
+    """Ask for SIGTERM when the parent of this process ends, whatever ends it."""
+    with contextlib.suppress(AttributeError):
+        _LIBC.prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
 
 
 def end(process: subprocess.Popen[bytes], patience: float, how: int = 0) -> None:

@@ -268,7 +268,7 @@ class ConditionsJudge(Judge):
     """Success where all of some conditions hold, for some ticks in a row: a task that needs no kernel of its own.
 
     The margin is the smallest slack of the conditions, in metres, metres per second and cosines alike: at least 0 where
-    all hold at this instant. It is not differentiable.
+    all hold at this instant.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class ConditionsJudge(Judge):
 
     def decide(self, physics: Physics) -> None:
         """See `Judge.decide`."""
-        from arena_newton.kernels.rules.predicates import launch_conditions
+        from arena_newton.kernels.rules.success_conditions import launch_conditions
 
         launch_conditions(
             physics.xpos,

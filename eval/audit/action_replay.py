@@ -5,16 +5,25 @@ What the policy was shown is drawn again at its queries; a policy is asked again
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.asked_again import Answers, AskedAgain, RecordedQueries
+from arena_newton.eval.audit.claimed_conditions import (
+    hold_environment,
+    hold_plan,
+    hold_policy,
+    hold_signals,
+    note_difference,
+)
 from arena_newton.eval.audit.folder_audit import Audit
-from arena_newton.eval.audit.tick_check import EPISODE, START, StatesAgain
+from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
@@ -22,15 +31,17 @@ from arena_newton.eval.plan.options import Batch, Chunks, Conditions, Remote, Ru
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run import check_parts, make_env
 from arena_newton.eval.play.run_flow import groups
+from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.identity import differing_key
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.files.stored_json import loaded, shown
 from arena_newton.files.text import counted
-from arena_newton.interfaces import EpisodeResult, Recorder
+from arena_newton.interfaces import EpisodeResult, Recorder, World
 from arena_newton.pictures.settings import SIZE_LIMITS, CameraConfig
 from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
+from arena_newton.trackers.base import Tracker
 
 __all__ = ["ENGINE", "drawn", "found_probability", "replay", "played", "rollout_flags", "stored_cameras", "through"]
 
@@ -41,6 +52,10 @@ EVIDENCE = ("final_state", "shown")
 ENGINE = "mujoco"
 DECIDED = ("outcome", "reason")
 """Keys of a line that episodes of another engine must give when each tick is checked from its recorded state."""
+DRIFT = 4.0
+"""Tolerances of a tick that the differences of a second may add up to."""
+UNITS = {"positions": "m", "velocities": "m/s or rad/s"}
+MEASURED = ("position", "velocity", "position over a second", "velocity over a second")
 LATE = 2
 """Ticks by which such an episode may end earlier or later: a force or margin near its bar."""
 FORGED = (0.01, 0.05, 0.1, 0.25)
@@ -86,6 +101,7 @@ def replay(
     policy: str | None = None,
     tolerance: float = 0.0,
     tick_tolerance: float = 0.005,
+    velocity_tolerance: float = 1.0,
 ) -> None:
     """Play episodes again, and add what differs to the audit's contradictions.
 
@@ -96,6 +112,7 @@ def replay(
         policy: Spec of a policy to ask again at the recorded queries.
         tolerance: Largest difference of an action that is still the policy's.
         tick_tolerance: Largest distance of a body after a tick of another engine [m].
+        velocity_tolerance: Largest difference of a velocity then [m/s, rad/s].
 
     Raises:
         InputError: They were played on another engine and no states were recorded, are demonstrations, were played
@@ -111,15 +128,20 @@ def replay(
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
     totals = _Totals()
     if records:
-        _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tick_tolerance=tick_tolerance)
+        tolerances = tick_tolerance, velocity_tolerance
+        _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tolerances=tolerances)
     audit.replayed = len(records)
+    audit.largest |= {"answer": totals.largest} if policy is not None else {}
+    audit.largest |= dict(zip(MEASURED, totals.furthest, strict=True)) if by_tick else {}
     odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
     sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
     if by_tick:
         audit.notes.append(
-            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it. Bodies "
-            f"are {totals.furthest:.2g} m off at most (--tick-tolerance {tick_tolerance:g}), no bit counts."
+            f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it, no bit "
+            f"counts. At most off are bodies {totals.furthest[0]:.2g} m (--tick-tolerance {tick_tolerance:g}) and "
+            f"velocities {totals.furthest[1]:.2g} m/s or rad/s (--velocity-tolerance {velocity_tolerance:g}); over a "
+            f"second they add up to {totals.furthest[2]:.2g} and {totals.furthest[3]:.2g}, allowed are {DRIFT:g} times."
         )
     if policy is not None:
         audit.asked = len(records)
@@ -138,8 +160,13 @@ class _Totals:
     equal: int = 0
     largest: float = 0.0
     """Largest difference of one."""
-    furthest: float = 0.0
-    """Largest distance of a body after a tick [m]."""
+    furthest: tuple[float, ...] = (0.0,) * 4
+    """Largest difference of a position [m] and a velocity [m/s, rad/s] after a tick, and added up over a second."""
+
+    def add(self, found: TickDifferences) -> None:
+        """Take up the ticks of an episode."""
+        largest = (float(values.max()) for values in (*found.of_ticks(), *found.of_seconds()))
+        self.furthest = tuple(map(max, self.furthest, largest))
 
 
 def _play(
@@ -152,51 +179,78 @@ def _play(
     totals: _Totals,
     *,
     by_tick: bool,
-    tick_tolerance: float,
+    tolerances: tuple[float, float],
 ) -> None:
     """Play these episodes of a folder's plan, and compare each."""
     run, wanted = audit.run, {_key(record): record for record in records}
     plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
-    for tracker in dict.fromkeys(record.tracker for record in records):
-        if getattr(made.tracker(tracker, plan.checkpoint), "lookahead", 0):
-            why = (
-                "reads the coming reference, which recorded actions do not hold: no replay can contradict its episodes"
-            )
-            raise InputError(f"--replay: {run.folder}: tracker {tracker} {why}")
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
     measured = bool(stored.recorder) or made.recorders is not Factories.recorders
     asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
-    for tracker in dict.fromkeys(record.tracker for record in records):
-        actions = run.folder / actions_folder(stored.tracker, tracker)
-        chosen = tuple(episode for episode in plan.episodes if episode.tracker == tracker and _key(episode) in wanted)
-        config = dataclasses.replace(through(plan, tracker, chosen), policy=f"replay:{actions}")
-        config, player = check_parts(config, made)
-        again: Policy | None = None
-        try:
+    made = dataclasses.replace(made, tracker=_without_window(made, f"--replay: {run.folder}"))
+    with contextlib.ExitStack() as ended:
+        parts = []
+        for tracker in dict.fromkeys(record.tracker for record in records):
+            actions = run.folder / actions_folder(stored.tracker, tracker)
+            chosen = tuple(one for one in plan.episodes if one.tracker == tracker and _key(one) in wanted)
+            config = dataclasses.replace(through(plan, tracker, chosen), policy=f"replay:{actions}")
+            config, player = check_parts(config, made)
+            ended.callback(player.close)
+            parts.append((tracker, chosen, config, player))
+        for tracker, chosen, config, player in parts:
+            if not by_tick:
+                hold_plan(audit, config)
+            again: Policy | None = None
             if policy is not None:
                 other, again = check_parts(through(asked, tracker, chosen), made)
-                _note_differences(audit, other, ("policy", "policy_file", "policy_facts", "labels"))
+                ended.callback(again.close)
+                _note_differences(audit, other, ("policy", "policy_facts", "labels"))
+                hold_policy(audit, other)
             for (task, _, mode), group in groups(chosen).items():
-                cameras = stored_cameras(audit, f"{task} {tracker} {mode}") if again is None else other.cameras
+                name = f"{task} {tracker} {mode}"
+                cameras = stored_cameras(audit, name) if again is None else other.cameras
                 lines = {episode.index: wanted[_key(episode)] for episode in group}
                 media = {index: line.media or {} for index, line in lines.items()}
                 recorded = {i: RecordedQueries.read(run.folder / files["actions"]) for i, files in media.items()}
                 seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
                 states = StatesAgain({i: run.folder / files.get(EPISODE, "") for i, files in media.items()})
+                signals: list[SignalRecorder] = []
+
+                def opened(
+                    env: World, name: str = name, config: RunConfig = config, signals: list[SignalRecorder] = signals
+                ) -> Sequence[Recorder]:
+                    if by_tick:
+                        return ()
+                    hold_environment(audit, config, name, env)
+                    signals += [SignalRecorder(env)] if stored.failures else []
+                    return signals
+
                 recorders = [states, seen] if by_tick else [seen]
-                for result in played(dataclasses.replace(config, cameras=cameras), made, player, group, recorders):
+                seeing = dataclasses.replace(config, cameras=cameras)
+                for result in played(seeing, made, player, group, recorders, opened):
                     index = result.episode.index
                     if by_tick:
-                        _compare_ticks(audit, lines[index], result, states.differences[index], tick_tolerance)
-                        totals.furthest = max([totals.furthest, *states.differences[index][1:]])
+                        _compare_ticks(audit, lines[index], result, states.differences[index], tolerances)
+                        totals.add(states.differences[index])
                     else:
                         _compare(audit, lines[index], result, seen.taken(index)[1], measured=measured)
+                    for recorder in signals:
+                        hold_signals(audit, lines[index], recorder)
                 for index, answers in seen.answers.items():
                     _judge_answers(audit, lines[index], answers, totals)
-        finally:
-            player.close()
-            if again is not None:
-                again.close()
+
+
+def _without_window(made: Factories, where: str) -> Callable[[str, Path | None], Tracker]:
+    """Constructor of trackers whose episodes recorded actions can give again."""
+
+    def tracker(spec: str, checkpoint: Path | None) -> Tracker:
+        one = made.tracker(spec, checkpoint)
+        if getattr(one, "lookahead", 0):
+            why = "reads the coming reference, which recorded actions do not hold"
+            raise InputError(f"{where}: tracker {spec} {why}: no replay can contradict its episodes")
+        return one
+
+    return tracker
 
 
 def through(plan: RunConfig, tracker: str, chosen: tuple[Episode, ...]) -> RunConfig:
@@ -224,11 +278,26 @@ def _key(one: EpisodeRecord | Episode) -> tuple[object, ...]:
 
 
 def played(
-    config: RunConfig, made: Factories, policy: Policy, group: Sequence[Episode], recorders: Sequence[Recorder] = ()
+    config: RunConfig,
+    made: Factories,
+    policy: Policy,
+    group: Sequence[Episode],
+    recorders: Sequence[Recorder] = (),
+    opened: Callable[[World], Sequence[Recorder]] = lambda env: (),
 ) -> Iterator[EpisodeResult]:
-    """Episodes of one task, tracker and mode, played in an environment of their own, as they end."""
+    """Episodes of one task, tracker and mode, played in an environment of their own.
+
+    Args:
+        config: The run, with the parts of `check_parts`.
+        made: What the environment is made with.
+        policy: The policy.
+        group: The episodes.
+        recorders: What records them.
+        opened: Is given the environment before the first; gives recorders that need it.
+    """
     env = make_env(config, made, group[0], min(config.flags.worlds, len(group)))
     try:
+        recorders = [*recorders, *opened(env)]
         results: list[EpisodeResult] = []
         latency = config.flags.latency_ticks
         Rollout(
@@ -265,10 +334,8 @@ def _note_differences(audit: Audit, config: RunConfig, keys: Sequence[str]) -> N
     """Say where what is installed or asked here is not what the run names."""
     here, there = config.identity(), audit.run.config
     for key in keys:
-        found = differing_key({key: there.get(key)}, {key: here.get(key)})
-        note = f"Replayed with another {key} than the run's: what differs may come of that."
-        if found is not None and note not in audit.notes:
-            audit.notes.append(note)
+        if differing_key({key: there.get(key)}, {key: here.get(key)}) is not None:
+            note_difference(audit, key)
 
 
 def _compare(
@@ -287,7 +354,7 @@ def _compare(
 
 
 def _compare_ticks(
-    audit: Audit, record: EpisodeRecord, result: EpisodeResult, differences: Sequence[float], tolerance: float
+    audit: Audit, record: EpisodeRecord, result: EpisodeResult, found: TickDifferences, tolerances: tuple[float, float]
 ) -> None:
     """Hold an episode of another engine, whose ticks were checked one by one, to its line and recorded states."""
     where = f"{audit.run.folder / JOURNAL_FILE}: episode {record.index}"
@@ -296,14 +363,17 @@ def _compare_ticks(
             audit.faults.append(f"{where}: {name} is {shown(was)}, its recorded states give {shown(now)}")
     if abs(record.steps - result.steps) > LATE:
         audit.faults.append(f"{where}: ended after {record.steps} steps, its recorded states end after {result.steps}")
-    first, after = differences[0], differences[1:]
-    if first > START:
-        audit.faults.append(f"{where}: its first state is {first:.2g} m from that of its seed")
-    if len(differences) <= min(record.steps, result.steps):
-        audit.faults.append(f"{where}: states of its first {counted(len(after), 'tick')} alone are recorded")
-    if (worst := max(after, default=0.0)) > tolerance:
-        tick = after.index(worst)
-        audit.faults.append(f"{where}: the state after tick {tick} is {worst:.2g} m from what {ENGINE} gives")
+    if found.first > START:
+        audit.faults.append(f"{where}: its first state is {found.first:.2g} m from that of its seed")
+    if found.states <= min(record.steps, result.steps):
+        few = counted(max(found.states - 1, 0), "tick")
+        audit.faults.append(f"{where}: states of its first {few} alone are recorded")
+    for ticks, factor, largest in ((1, 1.0, found.of_ticks()), (SECOND, DRIFT, found.of_seconds())):
+        for name, differences, tolerance in zip(("positions", "velocities"), largest, tolerances, strict=True):
+            if (worst := float(differences.max())) > factor * tolerance:
+                at = int(differences.argmax())
+                moment = f"after tick {at}" if ticks == 1 else f"added up over a second from tick {at} on"
+                audit.faults.append(f"{where}: {name} {moment} are {worst:.2g} {UNITS[name]} from what {ENGINE} gives")
 
 
 def _short(value: object) -> str:

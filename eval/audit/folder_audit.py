@@ -64,6 +64,9 @@ class Audit:
     """Episodes at whose queries the policy was asked again."""
     fresh: int | None = None
     """Episodes on seeds of the auditor."""
+    largest: dict[str, float] = field(default_factory=dict)
+    """Largest differences that were measured, by name: `answer` of a policy; `position` [m] and `velocity` [m/s, rad/s]
+    after a tick of another engine, and of both the sum over a second."""
 
     @property
     def level(self) -> str:
@@ -94,6 +97,7 @@ class Audit:
             "contradictions": self.faults,
             "notes": self.notes,
             "replayed": self.replayed,
+            "largest differences": self.largest,
         }
 
 
@@ -128,9 +132,16 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         found.notes.append(f"{counted(len(found.lacking), 'episode')} cannot be replayed: the actions are not there.")
     if unshown := sum(record.actions is not None and record.shown is None for record in run.records):
         found.notes.append(f"{counted(unshown, 'episode')} without a hash of what the policy was shown: not compared.")
+    if retried := len({one.index for one in records if one.outcome == "error"} & _ended(records)):
+        found.notes.append(f"{counted(retried, 'episode')} ended as an error first, and was played again.")
     if not found.results["complete"]:
         found.notes.append(f"Incomplete: {found.results['finished']} of {found.results['planned']} episodes.")
     return found
+
+
+def _ended(records: Sequence[EpisodeRecord]) -> set[int]:
+    """Numbers of the episodes that ended otherwise than as an error."""
+    return {one.index for one in records if one.outcome != "error"}
 
 
 def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit, published: str | None) -> Iterator[str]:
@@ -163,7 +174,8 @@ def _derived_faults(run: RunRecord, found: Audit) -> Iterator[str]:
             if name != "report.html" or _shown(data.decode(errors="replace"), names) != _shown(text, names):
                 yield f"{path}: {again}"
             else:
-                found.notes.append(f"{name} was written with another template: its figures and names were compared.")
+                what = "the figures and names in its text were compared, not what its style and script show"
+                found.notes.append(f"{name} was written with another template: {what}.")
         elif not here and name == "results.json" and not _same_figures(data, found.results):
             yield f"{path}: its cells or suites are not those of the journal"
     extra = {path.relative_to(run.folder).as_posix() for path in (run.folder / ORIGINAL).rglob("*") if path.is_file()}

@@ -26,6 +26,9 @@ __all__ = ["action_faults", "configuration_faults", "is_current", "line_faults"]
 
 MAX_ACTIONS_BYTES = 64 << 20
 """Largest file of one episode's actions; one of 2,000 ticks has 0.1 MB."""
+FLAGS = "task mode tracker rules seeds repeats max_steps engine fast_physics drive".split()
+FLAGS += "replan ensemble latency_ticks until_width max".split()
+"""Flags of a run that its identity names too: the latter is in tables, by the former it is played again."""
 ROUNDING = 1e-6
 """Durations are written with so many seconds' precision."""
 
@@ -49,6 +52,12 @@ def configuration_faults(run: RunRecord) -> Iterator[str]:
         and document["rule_set"] != dict(rule_sets.table(rule_sets.get(config["rules"], config["task"])))
     ):
         yield f"{path}: rule_set is not what the rule set {config['rules']} of this hash says"
+    options: Mapping[str, object] = document["options"] if is_current(run) else {}
+    for name in FLAGS:
+        if name in options and (options[name] or None) != ((named := config.get(name)) or None):
+            yield f"{path}: config: {name} is {shown(named)}, its options have {shown(options[name])}"
+    if "variant" in options and (options["variant"] is None) != (config.get("variant") is None):
+        yield f"{path}: config: variant is {shown(config.get('variant'))}, its options have {shown(options['variant'])}"
     if run.status is not None and run.status["state"] == "success" and not is_complete(run):
         yield f"{path}: status is success, but {len(run.records)} episodes do not complete the plan"
 
@@ -61,6 +70,7 @@ def line_faults(run: RunRecord, records: Sequence[EpisodeRecord]) -> Iterator[st
         records: All lines of its journal.
     """
     known, hashes = step_budgets(run.config), _hashes(run.document)
+    watched = is_current(run) and run.document["options"].get("failures") is True
     for record in records:
         where = f"{run.folder / JOURNAL_FILE}: episode {record.index}"
         named = hashes | {"checkpoint": [_checkpoint(run.document, record.tracker)]}
@@ -75,6 +85,8 @@ def line_faults(run: RunRecord, records: Sequence[EpisodeRecord]) -> Iterator[st
         details = [*_ending(record, facts), *_ticks(record)]
         if record.schema > 1 and record.task in known and record.outcome != "error":
             details += _predicates(record)
+        if watched and record.signals is None and record.steps:
+            details.append("has no signals of its failure, which the run kept")
         for text in details:
             yield f"{where}: {text}"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,48 @@ from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 
-__all__ = ["EPISODE", "START", "StatesAgain"]
+__all__ = ["EPISODE", "SECOND", "START", "StatesAgain", "TickDifferences"]
 
 EPISODE = "episode"
 """Name of the recording of an episode among its media."""
 START = 0.01
 """Largest distance of a body in the first recorded state from where the seed puts it, after the start-up [m]."""
+
+SECOND = 50
+"""Ticks whose differences are also added up: a small one that always points the same way moves a body in time."""
+
+
+@dataclass
+class TickDifferences:
+    """Recorded states of an episode, each less the one that a tick from the recorded state before it gives."""
+
+    first: float = 0.0
+    """Largest distance along an axis of a body in the first state from where the seed puts it [m]."""
+    states: int = 0
+    """Recorded states that were compared."""
+    positions: list[np.ndarray] = field(default_factory=list)
+    """Differences of all bodies after each tick [m], each of shape [bodies, 3]."""
+    velocities: list[np.ndarray] = field(default_factory=list)
+    """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; the last state has none."""
+
+    def of_ticks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest difference of a position and of a velocity after each tick."""
+        return _largest(self.positions, 1), _largest(self.velocities, 1)
+
+    def of_seconds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest sum over `SECOND` ticks of the differences of a position and of a velocity."""
+        return _largest(self.positions, SECOND), _largest(self.velocities, SECOND)
+
+
+def _largest(differences: list[np.ndarray], ticks: int) -> np.ndarray:
+    """Largest absolute sum of a number over so many ticks, from each tick on; from the first alone if they are few."""
+    if not differences:
+        return np.zeros(1)
+    rows = np.stack(differences).reshape(len(differences), -1)
+    sums = np.vstack([np.zeros(rows.shape[1]), np.cumsum(rows, axis=0)])
+    many = min(ticks, len(rows))
+    largest: np.ndarray = np.abs(sums[many:] - sums[:-many]).max(axis=1)
+    return largest
 
 
 @dataclass
@@ -40,9 +76,8 @@ class StatesAgain(Recorder):
     def __init__(self, files: Mapping[int, Path]):
         """Take the recordings of `eval run --record` by the episode's number."""
         self.files = files
-        self.differences: dict[int, list[float]] = {}
-        """Largest distance along an axis of a body from its recorded position, before each tick and at the end [m], by
-        the episode's number; the first is after the start-up from the seed, the others after one tick each."""
+        self.differences: dict[int, TickDifferences] = {}
+        """Differences by the episode's number."""
         self._states: dict[int, _Recorded] = {}
 
     def start(self, env: World, world: int, episode: Episode) -> None:
@@ -57,7 +92,7 @@ class StatesAgain(Recorder):
         if not len(velocities):
             raise InputError(f"{file.path}: arena_qvel holds no tick")
         self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities)
-        self.differences[episode.index] = []
+        self.differences[episode.index] = TickDifferences()
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
         """Measure how far off the recorded state is, and take it up."""
@@ -72,9 +107,16 @@ class StatesAgain(Recorder):
     def _take_up(self, env: World, world: int, tick: int) -> None:
         """Put a world into the recorded state at a tick; one that goes on after its recording stays as it is."""
         assert isinstance(env.physics, MujocoPhysics), "the audit plays on engine mujoco"
-        mine, places = self._states[world], env.physics.xpos.numpy()[world]
+        mine = self._states[world]
         if tick >= len(mine.positions):
             return
-        given = places.copy()
-        env.physics.put(world, mine.positions[tick], mine.velocities[min(tick, len(mine.velocities) - 1)])
-        self.differences[mine.index].append(float(np.abs(places - given).max()))
+        found, last = self.differences[mine.index], min(tick, len(mine.velocities) - 1)
+        bodies = env.physics.xpos.numpy()[world]
+        given, moving = bodies.astype(np.float64), env.physics.qvel.numpy()[world].astype(np.float64)
+        env.physics.put(world, mine.positions[tick], mine.velocities[last])
+        if found.states:
+            found.positions.append(bodies - given)
+            found.velocities += [mine.velocities[tick] - moving] if tick == last else []
+        else:
+            found.first = float(np.abs(bodies - given).max())
+        found.states += 1

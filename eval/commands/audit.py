@@ -39,7 +39,9 @@ class AuditOptions:
     another processor."""
     tick_tolerance: float = 0.005
     """Largest distance of a body after a tick [m], where a run of engine warp kept its states (--record)
-    and each tick is checked on engine mujoco."""
+    and each tick is checked on engine mujoco; over a second differences may add up to four times as much."""
+    velocity_tolerance: float = 1.0
+    """Largest difference of a velocity then [m/s, rad/s]."""
     fresh: int = 0
     """Play so many new episodes of --policy for each task, tracker and mode, on a group seed drawn by --draw; an exact
     test compares their rate with the claimed one."""
@@ -82,7 +84,8 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         if options.replay or options.all:
             from arena_newton.eval.audit.action_replay import drawn, replay
 
-            asked = {name: getattr(options, name) for name in ("policy", "tolerance", "tick_tolerance")}
+            names = ("policy", "tolerance", "tick_tolerance", "velocity_tolerance")
+            asked = {name: getattr(options, name) for name in names}
             chosen = drawn(one, None if options.all else options.replay, draw)
             replay(one, chosen, factories, **asked)
         if options.fresh and options.policy is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from arena_newton.errors import InputError
 from arena_newton.eval.loop.loop_options import LoopOptions
 
 if TYPE_CHECKING:
@@ -17,6 +18,13 @@ def run(options: LoopOptions, factories: Factories | None = None) -> int:
     from arena_newton.eval.loop.loop_requirements import check_libraries
 
     check_libraries(options.policy)
+    if options.plan is not None:
+        from arena_newton.eval.loop import plan_loop
+
+        return plan_loop.run(options)
+    for name in ("rows", "seeds", "only"):
+        if getattr(options, name):
+            raise InputError(f"--{name}: belongs to --plan, which is not given")
     from arena_newton.eval.loop import learning_loop
 
     return learning_loop.run(options, factories)

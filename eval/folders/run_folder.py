@@ -219,11 +219,13 @@ class ResultsFolder:
         stored = self.check()
         self.document = self._new_document() if stored is None else stored
         documents.check_plan(self.path, played, self.document)
-        sets = _versions(self.document)
+        sets, lacking = _versions(self.document), self.document["options"].get("actions") and not config.flags.actions
         if moving_versions(self.installed) not in map(moving_versions, sets):
             self.document["later_versions"] = [*sets[1:], self.installed]
-        elif stored is not None:
+        elif stored is not None and not lacking:
             return
+        if lacking:
+            self.document["options"]["actions"] = False
         self._save()
 
     def _new_document(self) -> Document:

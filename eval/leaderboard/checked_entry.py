@@ -11,8 +11,9 @@ from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import Audit, audited, runs_in
 from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, BoardEntry, read_entry
 from arena_newton.eval.leaderboard.result_bundle import unpack
+from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS, PROTOCOL_SEEDS
 from arena_newton.eval.records.chain import joint_head
-from arena_newton.eval.records.document import SUITE_FILE
+from arena_newton.eval.records.document import SUITE_FILE, step_budgets
 from arena_newton.eval.records.identity import hash_path
 from arena_newton.eval.tables.condition_rates import (
     ConditionRate,
@@ -24,13 +25,16 @@ from arena_newton.eval.tables.episode_table import PlayedCell
 from arena_newton.eval.tables.evaluated_cells import read_cells
 from arena_newton.eval.tables.paper_numbers import FAMILIES, published
 from arena_newton.files.stored_json import shown
-from arena_newton.files.text import plain
+from arena_newton.files.text import counted, plain
 from arena_newton.trackers import shipped_weights
 
 if TYPE_CHECKING:
     from arena_newton.eval.play.factories import Factories
 
 __all__ = ["CheckedEntry", "check_entry"]
+
+PROTOCOL_RULES = "paper"
+"""Rule set of the protocol."""
 
 
 @dataclass
@@ -106,7 +110,11 @@ def _audit(
             number = f"{audit.results['finished']} of {audit.results['planned']} episodes"
             checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: a run of {number}; rates are of whole plans")
     found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
-    if found != (said := checked.entry.head):
+    if not found:
+        checked.faults.append(
+            f"{checked.name}/{BUNDLE_FILE}: a version without chain wrote its lines; they have no head"
+        )
+    elif found != (said := checked.entry.head):
         checked.faults.append(f"{checked.name}/{ENTRY_FILE}: head is {shown(said)}, its runs have {shown(found)}")
     if checked.faults:
         return []
@@ -120,6 +128,12 @@ def _unusual(cell: PlayedCell) -> str:
     """Conditions of a cell that are not the protocol's, in words."""
     drive = plain(cell.run.config.get("drive", "auto"))
     found = [f"drive {drive}"] * (drive != "auto") + ["fast physics"] * bool(cell.run.config.get("fast_physics"))
+    config = cell.run.config
+    if tuple(config["seeds"]) != PROTOCOL_SEEDS or config["repeats"] != PROTOCOL_REPEATS:
+        found.append(f"seeds {' '.join(map(str, config['seeds'][:9]))}, {counted(config['repeats'], 'repeat')} of each")
+    found += [f"rules {plain(config['rules'])}"] * (config["rules"] != PROTOCOL_RULES)
+    found += ["rules of another version"] * (not step_budgets(config))
+    found += [f"at most {config['max_steps']} steps"] * (config["max_steps"] is not None)
     weights, path = cell.records[0].hashes.get("checkpoint"), shipped_weights(cell.tracker)
     other = weights is not None and (path is None or weights != hash_path(path))
     return ", ".join(found + [f"other weights {plain(weights)}"] * other)

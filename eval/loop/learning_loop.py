@@ -23,12 +23,12 @@ from arena_newton.eval.loop import loop_report
 from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING
 from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
+from arena_newton.eval.loop.stage_state import succeeded, trained
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
 from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run import execute
-from arena_newton.eval.records.document import read_document
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.new_folder import held_folder
@@ -41,7 +41,7 @@ from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.training import train
 from arena_newton.policies.train.training_check import check_training
-from arena_newton.policies.train.training_state import TrainingProgress, last_checkpoint
+from arena_newton.policies.train.training_state import last_checkpoint
 
 __all__ = ["LOOP_FILE", "is_begun", "resolved", "run"]
 
@@ -213,26 +213,12 @@ class _Loop:
     def finished(self) -> int:
         """Number of finished stages; what those before the last of them left may be gone."""
         whole = (
-            self._succeeded(RECORDINGS),
+            succeeded(self.out / RECORDINGS),
             (self.out / DATASET).is_dir(),
-            self._trained(),
-            self._succeeded(EVALUATION),
+            trained(self.out / TRAINING),
+            succeeded(self.out / EVALUATION),
         )
         return max((number for number, one in enumerate(whole, 1) if one), default=0)
-
-    def _succeeded(self, name: str) -> bool:
-        try:
-            state = read_document(self.out / name)["status"]["state"]
-        except (InputError, KeyError):  # the run itself says what is wrong with its folder
-            return False
-        return state == "success" and (self.out / name / "report.html").is_file()
-
-    def _trained(self) -> bool:
-        try:
-            progress = TrainingProgress.read(last_checkpoint(self.out / TRAINING))
-        except InputError:  # and the training with its own
-            return False
-        return 0 < progress.steps <= progress.step
 
     def play(self) -> int:
         """Play what is left, and report."""

@@ -25,7 +25,8 @@ class LoopOptions:
     recipe: str | None = None
     """Settings of the training: fast (when none is named), paper, released, compact."""
     minutes: float | None = None
-    """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given."""
+    """Time of the training [min]; the schedule is fitted to it. The recipe's number of steps when none is given. With
+    --plan that of all stages: trainings have what recording and the plan's reserve leave."""
     steps: int | None = None
     """Optimizer steps instead of the recipe's."""
     episodes: int | None = None
@@ -44,6 +45,15 @@ class LoopOptions:
     """Cap on the step budget of the rule set [ticks of 0.02 s]."""
     weights: str | None = None
     """Pretrained weights for the training: a name on the hub or a local folder."""
+    plan: str | None = None
+    """Play a plan instead: a TOML file of sets, rows of trainings, seeds and suites, or the name of one that comes with
+    the package, generalist or tiny (docs/howto/train/loop.md)."""
+    rows: Several[str] = ()
+    """With --plan: rows that are trained and played; the first one when none is named."""
+    seeds: Several[int] = ()
+    """With --plan: seeds of the trainings of each row instead of the plan's."""
+    only: Several[str] = ()
+    """With --plan: stages that are played: record build train evaluate tables card."""
     small: bool = False
     """A loop for tests of the machinery: few episodes, small pictures, the recipe `small`; it learns nothing."""
     out: str | None = None

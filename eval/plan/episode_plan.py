@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED
+from arena_newton.files.own_files import file_label
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.rules import modes as all_modes
 from arena_newton.rules import seeding
@@ -83,6 +84,10 @@ def expand(
         twice = next((v for v in values if list(values).count(v) > 1), None)
         if twice is not None:
             raise InputError(f"{flag} {twice}: given twice")
+    if len({file_label(name) for name in trackers}) < len(trackers):
+        raise InputError(
+            f"--tracker {' '.join(trackers)}: two have one name as a folder of actions; play each by itself"
+        )
     high = max(seeds)
     if high > MAX_SEED:
         raise InputError(f"{seeds_flag} {_cut(high)}: expected at most {MAX_SEED}")

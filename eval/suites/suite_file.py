@@ -35,6 +35,7 @@ __all__ = [
     "Selector",
     "SuiteFile",
     "read_suite_file",
+    "read_toml",
     "suite_path",
 ]
 
@@ -162,7 +163,7 @@ def read_suite_file(path: Path) -> SuiteFile:
     Raises:
         InputError: It is no TOML, or a table, key or value is unknown; the message names file, table and key.
     """
-    content, digest = _toml(path)
+    content, digest = read_toml(path)
     _check_names(str(path), content, TABLES)
     name = content.get("name", path.stem)
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9+_.-]{1,64}", name) or name.startswith("."):
@@ -195,8 +196,12 @@ def read_suite_file(path: Path) -> SuiteFile:
     )
 
 
-def _toml(path: Path) -> tuple[JsonObject, str]:
-    """Content of a TOML file as JSON has it, and its hash."""
+def read_toml(path: Path) -> tuple[JsonObject, str]:
+    """Content of a TOML file as JSON has it, and its hash.
+
+    Raises:
+        InputError: It cannot be read, or holds what JSON has not.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: {path.stat().st_size:,} bytes, expected at most {MAX_BYTES:,}")

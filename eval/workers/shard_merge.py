@@ -284,7 +284,8 @@ def _document(runs: Sequence[RunRecord], out: Path, *, whole: bool) -> Document:
     """config.json of all: the first folder's, with the environments and versions of the others."""
     document: Document = dict(runs[0].document)  # type: ignore[assignment]  # a copy of one
     document.pop("shard", None)
-    document["options"] = runs[0].document["options"] | {"shard": None, "out": str(out)}
+    kept = all(run.document["options"].get("actions", True) for run in runs)
+    document["options"] = runs[0].document["options"] | {"shard": None, "out": str(out), "actions": kept}
     environments: dict[str, JsonObject] = {}
     for run in runs:
         environments = run.document.get("environments", {}) | environments

@@ -1,18 +1,18 @@
-"""Conditions, and what is made of them: the predicates on the way to success, and success where it is a conjunction.
+"""Conditions, and the predicates on the way to success that are made of them.
 
 A predicate is the conjunction of conditions, each of which compares one measured quantity with a limit. Points and
-boxes are fixed to bodies. Nothing here is differentiable; the margins in `success` are.
+boxes are fixed to bodies. Predicates are not differentiable; the margins in `success` and `success_conditions` are.
 """
 
 # ruff: noqa: UP018 - `int(0)` declares a variable in Warp, `0` a constant that a loop may not change
 
 import warp as wp
 
-from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation, count_up
+from arena_newton.kernels.boxes import FAR, Boxes, body_position, body_rotation, box_centre, box_rotation
 from arena_newton.kernels.launching import launch
 
 __all__ = ["ANGLE", "AWAY", "CLEAR", "MARGIN", "NEAR", "SLOW", "TERM", "TOWARD", "UNLATCHED", "UPRIGHT"]
-__all__ += ["launch_conditions", "launch_predicates"]
+__all__ += ["gap", "launch_predicates", "measured"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,6 +65,25 @@ def distance_to_box(v: wp.vec3, half: wp.vec3, horizontal: int) -> float:
 
 
 @wp.func
+def gap(
+    xpos: wp.array3d[float],
+    xquat: wp.array3d[float],
+    point_body: wp.array[int],
+    point_pos: wp.array[wp.vec3],
+    boxes: Boxes,
+    w: int,
+    p: int,
+    b: int,
+    horizontal: int,
+) -> float:
+    """Distance [m] of point `p` to box `b`, as `distance_to_box`."""
+    body = point_body[p]
+    point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
+    offset = point - box_centre(xpos, xquat, boxes, w, b)
+    return distance_to_box(wp.quat_rotate_inv(box_rotation(xquat, boxes, w, b), offset), boxes.half[b], horizontal)
+
+
+@wp.func
 def measured(
     xpos: wp.array3d[float],
     xquat: wp.array3d[float],
@@ -88,12 +107,8 @@ def measured(
     if kind == NEAR or kind == CLEAR:
         nearest = float(FAR)
         for p in range(p0, terms[t, 4]):
-            body = point_body[p]
-            point = body_position(xpos, w, body) + wp.quat_rotate(body_rotation(xquat, w, body), point_pos[p])
             for b in range(b0, terms[t, 6]):
-                offset = point - box_centre(xpos, xquat, boxes, w, b)
-                v = wp.quat_rotate_inv(box_rotation(xquat, boxes, w, b), offset)
-                nearest = wp.min(nearest, distance_to_box(v, boxes.half[b], horizontal))
+                nearest = wp.min(nearest, gap(xpos, xquat, point_body, point_pos, boxes, w, p, b, horizontal))
         return nearest
     if kind == ANGLE:
         return wp.abs(qpos[w, address])
@@ -151,38 +166,6 @@ def predicates_kernel(
     predicates[w, k] = every
 
 
-@wp.kernel
-def conditions_kernel(
-    xpos: wp.array3d[float],
-    xquat: wp.array3d[float],
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    latched: wp.array[int],
-    ticks: int,
-    terms: wp.array2d[int],
-    limits: wp.array[float],
-    point_body: wp.array[int],
-    point_pos: wp.array[wp.vec3],
-    boxes: Boxes,
-    counter: wp.array[int],
-    success: wp.array[int],
-    margin: wp.array[float],
-):
-    """One thread per world: all conditions hold, `ticks` in a row; the margin is the smallest slack of them."""
-    w = wp.tid()
-    m = float(FAR)
-    for t in range(terms.shape[0]):
-        value = measured(xpos, xquat, qpos, qvel, latched, margin, terms, point_body, point_pos, boxes, w, t)
-        slack = value - limits[t]
-        if terms[t, 0] == NEAR or terms[t, 0] == SLOW:
-            slack = -slack
-        m = wp.min(m, slack)
-    count = count_up(m, counter[w])
-    counter[w] = count
-    margin[w] = m
-    success[w] = wp.where(count >= ticks, 1, 0)
-
-
 def launch_predicates(
     xpos: wp.array,
     xquat: wp.array,
@@ -219,32 +202,3 @@ def launch_predicates(
     state = [xpos, xquat, qpos, qvel, latched, success, margin]
     conditions = [first, terms, limits, point_body, point_pos, boxes]
     launch(predicates_kernel, predicates.shape, [*state, *conditions], [predicates])
-
-
-def launch_conditions(
-    xpos: wp.array,
-    xquat: wp.array,
-    qpos: wp.array,
-    qvel: wp.array,
-    latched: wp.array,
-    *,
-    ticks: int,
-    terms: wp.array,
-    limits: wp.array,
-    point_body: wp.array,
-    point_pos: wp.array,
-    boxes: Boxes,
-    counter: wp.array,
-    success: wp.array,
-    margin: wp.array,
-) -> None:
-    """Success of a task that is one conjunction of conditions.
-
-    Arguments that `launch_predicates` and `success` describe are not repeated.
-
-    Args:
-        ticks: Ticks in a row for which all must hold.
-    """
-    state = [xpos, xquat, qpos, qvel, latched, ticks]
-    conditions = [terms, limits, point_body, point_pos, boxes]
-    launch(conditions_kernel, success.shape, [*state, *conditions], [counter, success, margin])

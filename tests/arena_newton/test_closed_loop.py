@@ -1,5 +1,7 @@
 """The closed loop as one graph of torch: it is the episode, and its slopes are those of differences."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -205,6 +207,22 @@ def test_what_has_no_gradient_is_refused(hall):
         trackers.Tracker().graded(1)
 
 
+def test_dynamics_without_a_gradient_are_refused():
+    """An episode of mode dynamics whose latency or push acts is refused by the name of what acts; others are played."""
+    env = ArenaEnv(
+        "vis_navi", tracker=trackers.get("pd"), worlds=1, engine="mujoco", mode="dynamics", fast_physics=True
+    )
+    said = set()
+    for seed in range(12):
+        try:
+            with torch.no_grad():
+                assert closed_loop(env, plan(1), [seed], 1).qpos.isfinite().all()
+        except InputError as error:
+            said.add(re.sub("closed_loop: mode dynamics draws a (.*), which has no gradient", r"\1", str(error)))
+    assert {"state_latency", "action_latency"} <= said <= {"state_latency", "action_latency", "push"}
+    env.close()
+
+
 def test_reach_tells_a_slope_that_holds_from_one_that_does_not():
     """A slope that differences at one of two scales contradict is flagged, as of a sawtooth on a trend."""
 
@@ -231,6 +249,8 @@ def test_a_planning_model_is_no_engine():
     after, ball = env.physics.mj_model.geom_solimp, env.scene.geom_ids("/World/Ball")
     assert (after[ball, 0] == 1e-4).all() and (after[ball, 2] == 0.02).all()
     assert np.array_equal(after[robot], before[robot])
+    damping = -env.physics.mj_model.geom_solref[ball, 1] * env.physics.mj_model.opt.timestep
+    assert (damping < 0.2).all()  # 1 takes the approach away within a step
     assert env.describe()["engine"] == "mujoco, planning model: /World/Ball touches over 0.02 m"
     with pytest.raises(InputError, match="planning model .* no episode is played"):
         Rollout(env, policies.get("stand"), [])

@@ -136,7 +136,7 @@ def test_a_tutorial_runs_as_it_stands(part, tmp_path, monkeypatch, capsys):
         elif kind == "python":
             exec(compile(block, "docs/start/tutorials.md", "exec"), {"__name__": "tutorial"})
         else:
-            for line in block.splitlines():
+            for line in block.replace("\\\n", "").splitlines():
                 python, minus, module, *flags = shlex.split(line)
                 assert (python, minus) == ("python", "-m")
                 monkeypatch.setattr(sys, "argv", [module, *flags])

@@ -1,7 +1,9 @@
 """The bench of gradients: slopes of ticks and of closed loops are those of differences, and one that is off misses."""
 
 import pytest
+import torch
 
+from arena_newton.robot.canonical import STAND_ACTION
 from benchmarks import gradient_bench
 from benchmarks.bench_options import GradientBenchOptions
 
@@ -10,11 +12,13 @@ def test_ticks_and_loops_are_compared(monkeypatch):
     """Each task and tracker gives a figure of its ticks; each task of loops one per length and one of factors."""
     for name, value in (("LOOKS", 2), ("EVERY", 4), ("LOOPS", {2: 1e-3}), ("FACTOR_TICKS", 3)):
         monkeypatch.setattr(gradient_bench, name, value)
-    options = GradientBenchOptions(tasks=("football",), trackers=("pd",), states=6, loops=("vis_navi",))
+    options = GradientBenchOptions(
+        what=("ticks", "loops"), tasks=("football",), trackers=("pd",), states=6, loops=("vis_navi",)
+    )
     tick, loop, factors = gradient_bench.slope_figures(options)
     assert [figure.verdict for figure in (tick, loop, factors)] == ["pass"] * 3
-    assert tick.note.startswith("6 states; positions ") and loop.note.startswith("actions ")
-    assert factors.note.startswith("friction ") and "kd" in factors.note
+    assert tick.note.startswith("6 states; positions ") and loop.note.startswith("2 ticks; actions ")
+    assert factors.note.startswith("3 ticks; friction ") and "kd" in factors.note
     honest = gradient_bench.closed_loop
 
     def off(env, actions, *given, **named):
@@ -23,3 +27,30 @@ def test_ticks_and_loops_are_compared(monkeypatch):
 
     monkeypatch.setattr(gradient_bench, "closed_loop", off)
     assert gradient_bench._loop("vis_navi", "pd", 2, 1e-3).value == pytest.approx(0.01, rel=0.01)
+
+
+def test_a_loop_is_compared_with_the_episode_that_it_replays(monkeypatch):
+    """The distance is that of whole positions; a loop that starts elsewhere misses its bar."""
+    monkeypatch.setattr(gradient_bench, "LONGEST", 5)
+    found = gradient_bench._replay("vis_navi", "pd")
+    assert found.verdict == "pass" and found.note.startswith("5 ticks; pelvis ")
+    honest = gradient_bench.closed_loop
+
+    def off(*given):
+        rolled = honest(*given)
+        return rolled._replace(qpos=rolled.qpos + 2e-4)
+
+    monkeypatch.setattr(gradient_bench, "closed_loop", off)
+    assert gradient_bench._replay("vis_navi", "pd").verdict == "MISS"
+
+
+def test_what_holds_through_a_kick_is_counted():
+    """Of a ball that nobody touches all slopes hold, and no touch is found by name."""
+    env = gradient_bench._world("football", "pd")
+    stand = torch.tensor(STAND_ACTION).double().repeat(1, 4, 1)
+    found = gradient_bench._reach(env, [5], stand, 3, soft=True)
+    assert found.value == 3.0 and found.verdict == "pass" and "its start y +1.00 (+1.00, +1.00)" in found.note
+    still = gradient_bench.closed_loop(env, stand, [5], 4)
+    with pytest.raises(gradient_bench.InputError, match="football: the expert touches nothing within 4 ticks"):
+        gradient_bench.touch_of(env, still)
+    env.close()

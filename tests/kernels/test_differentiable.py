@@ -7,7 +7,8 @@ import warp as wp
 
 from arena_newton.differentiable import ReferenceState, reference_step, success_margin
 from arena_newton.kernels import canonical
-from arena_newton.kernels.rules import success
+from arena_newton.kernels.rules import predicates, success
+from arena_newton.kernels.rules.success_conditions import launch_conditions
 from arena_newton.robot import g1
 from tests.children import Child
 
@@ -142,6 +143,13 @@ def _cases(twin, device):
     door = {"doorway": _box(twin, device, 3, (0.5, 0.1, 1)), "half_width": 0.55, "min_y": 0.02}
     zone = {"feet": ids[2], "zone": _box(twin, device, 3, (0.5, 0.6, 1))}
     sofa = {"min_force": 50.0, "max_root_z": 0.8, "confirm_ticks": 25, "stiffness": 1.0}
+    near, slow, upright, toward, away, angle = (
+        int(getattr(predicates, kind)) for kind in ("NEAR", "SLOW", "UPRIGHT", "TOWARD", "AWAY", "ANGLE")
+    )
+    terms = [(near, 0, 0, 0, 2, 0, 3), (slow, 1, 0, 0, 0, 0, 0), (upright, 0, 0, 1, 2, 0, 0)]
+    terms += [(toward, 1, 0, 0, 1, 1, 2), (away, 0, 0, 1, 2, 2, 3), (angle, 0, 9, 0, 0, 0, 0)]
+    every = {"terms": wp.array(np.array(terms, np.int32), dtype=wp.int32, device=device), "ticks": 2}
+    every["limits"] = wp.array([0.3, 0.6, -0.6, -0.4, -0.6, 0.2], dtype=wp.float32, device=device)
     return {
         "football paper": (success.launch_football, football | {"rear_bound": True}, poses),
         "football released": (success.launch_football, football | {"rear_bound": False}, poses),
@@ -164,6 +172,11 @@ def _cases(twin, device):
         "boxing": (success.launch_boxing, punch | {"min_radius": 0.1, "pad": 0.08}, poses),
         "vis_navi": (success.launch_vis_navi, zone | root | STAND, (*poses, "qpos")),
         "vis_navi ring": (success.launch_vis_navi, zone | root | STAND | {"round_zone": True}, (*poses, "qpos")),
+        "conditions": (
+            launch_conditions,
+            free | every | {"point_body": ids[0], "point_pos": offsets, "boxes": decks},
+            (*poses, "qpos", "qvel"),
+        ),
     }
 
 
@@ -181,6 +194,7 @@ CASES = (
     "boxing",
     "vis_navi ring",
     "vis_navi",
+    "conditions",
 )
 
 

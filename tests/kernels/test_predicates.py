@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from arena_newton.kernels.rules import predicates
+from arena_newton.kernels.rules import predicates, success_conditions
 from arena_newton.kernels.rules.predicates import ANGLE, AWAY, CLEAR, MARGIN, NEAR, SLOW, TOWARD, UNLATCHED, UPRIGHT
 
 
@@ -146,7 +146,7 @@ def test_success_of_conditions_is_their_smallest_slack_for_some_ticks(twin, devi
     for speed in speeds:
         qvel = np.zeros((stage.worlds, 20), np.float32)
         qvel[:, 7] = speed
-        predicates.launch_conditions(
+        success_conditions.launch_conditions(
             *(stage.up(a) for a in (stage.xpos, stage.xquat, stage.qpos, qvel)),
             stage.up(np.zeros(stage.worlds), wp.int32),
             ticks=2,

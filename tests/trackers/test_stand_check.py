@@ -1,4 +1,4 @@
-"""Standing and turning in the lab show mistakes that shapes cannot show."""
+"""Standing, turning and walking in the lab show mistakes that shapes cannot show."""
 
 import dataclasses
 
@@ -7,6 +7,7 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.__main__ import main
+from arena_newton.robot.g1 import MUJOCO_TO_CANONICAL
 from arena_newton.trackers.evaluation import stand_check
 
 CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
@@ -26,18 +27,24 @@ def with_wrong_scale(tracker):
     tracker.front_end.action_form = dataclasses.replace(form, scale=tuple(-scale for scale in form.scale))
 
 
+def with_wrong_order(tracker):
+    write, order = tracker.front_end.write, list(MUJOCO_TO_CANONICAL)
+    tracker.front_end.write = lambda c, s: write(dataclasses.replace(c, joints=c.joints[:, order]), s)
+
+
 @pytest.mark.parametrize(
     "spoil, broken",
     [
         (lambda tracker: None, set()),
         (with_wrong_pose, {"joints"}),
         (with_wrong_turn, {"turn"}),
-        (with_wrong_scale, {"pelvis", "joints", "turn"}),
+        (with_wrong_order, {"walk"}),
+        (with_wrong_scale, {"pelvis", "joints", "turn", "walk"}),
     ],
-    ids=["right", "pose", "turn", "scale"],
+    ids=["right", "pose", "turn", "order", "scale"],
 )
 def test_mistakes_show(monkeypatch, spoil, broken):
-    """SONIC stands and turns; a default pose, a turn or a scale of the wrong sign breaks the measure that names it."""
+    """SONIC stands, turns and walks; a wrong pose, turn, order or scale breaks the measure that names it."""
     monkeypatch.setattr(stand_check, "ROLLOUTS", 1)
     tracker = trackers.get("sonic")
     spoil(tracker)

@@ -116,7 +116,7 @@ class Sample:
         return {"fell": fell, "count": count, "falls": rate}
 
 
-Numbers = dict[str, float]
+Numbers = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -223,11 +223,11 @@ def _blows(sample: Sample) -> Numbers:
         "high": 100 * high,
         "seconds": sample.mean("survival"),
         "blows": 100 * survived / max(blows, 1.0),
-        "recovery": recovery.mean() if len(recovery) else np.nan,
+        "recovery": f"{recovery.mean():.2f} s" if len(recovery) else "–",
     }
 
 
-_TOUR = "{up}/{count} = {percent:.0f} % [{low:.0f}, {high:.0f}], {seconds:.1f} s; blows {blows:.1f} %, {recovery:.2f} s"
+_TOUR = "{up}/{count} = {percent:.0f} % [{low:.0f}, {high:.0f}], {seconds:.1f} s; blows {blows:.1f} %, {recovery}"
 _BALL = "median {median:.1f} m/s (rolls {rolls:.1f}), {percent:.0f} % ≥ 1.5 m/s, falls {fell}/{count}"
 
 

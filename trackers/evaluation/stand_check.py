@@ -1,7 +1,8 @@
-"""Two seconds of standing and of turning in the lab, which show whether a tracker holds the robot.
+"""Two seconds of standing, turning and walking in the lab, which show whether a tracker holds the robot.
 
 Shapes and masks say nothing of signs, frames, order and scale. A wrong default pose, action scale or gain shows in
-height and joints; the wrong sign or frame of a turn in a robot that turns away from its reference.
+height and joints; the wrong sign or frame of a turn in a robot that turns away from its reference; the wrong sign of a
+commanded velocity, or commanded joints in another order, in one that does not walk with it.
 """
 
 from __future__ import annotations
@@ -19,30 +20,33 @@ from arena_newton.trackers.motions import primitives
 __all__ = ["stand"]
 
 SECONDS = 2.0
-"""Standing or turning after the start-up [s]."""
+"""Standing, turning or walking after the start-up [s]."""
 TURN = 0.5
 """Rate of the turns to the left and to the right [rad/s]."""
+WALK = 0.3
+"""Speed of the walks forward and backward [m/s]."""
 ROLLOUTS = 4
-"""Rollouts of each of the three; their starts differ by the suite's noise."""
+"""Rollouts of each of the five; their starts differ by the suite's noise."""
 HEIGHT = 0.6
 """Least height of the pelvis [m]."""
 JOINT_ERROR = 0.15
 """Largest mean error of the joints [rad] (the bar of HumanoidArena's body qualification)."""
 WORST = 0.4
 """Largest mean error of one joint [rad]: no tracker of this package has half of it but at a wrist (measured)."""
-FOLLOWED = 0.25
-"""Least part of a turn that is followed, the way it is commanded."""
+FOLLOWED = {"turn": 0.25, "walk": 0.45}
+"""Least part of a motion that is followed, the way it is commanded: SONIC with joints in another order walks 0.35."""
 
 
 @torch.inference_mode()
 def stand(tracker: Tracker, *, engine: str = "auto", device: str | None = None) -> list[CheckResult]:
-    """Findings of a tracker that is not bound yet: `pelvis` and `joints` while it stands, `turn` while it turns.
+    """Findings of a tracker that is not bound yet: `pelvis` and `joints` of standing, `turn` and `walk`.
 
     Raises:
         InputError: Engine or device is not available, or targets of another kind than the interface says.
     """
-    rates = {"stand": 0.0, "turn left": TURN, "turn right": -TURN}
-    scripts = {name: primitives.walk(0.0, turn=rate, seconds=SECONDS, pause=0.0) for name, rate in rates.items()}
+    speeds = {"stand": (0.0, 0.0), "turn left": (0.0, TURN), "turn right": (0.0, -TURN)}
+    speeds |= {"walk forward": (WALK, 0.0), "walk backward": (-WALK, 0.0)}
+    scripts = {n: primitives.walk(ahead, turn=rate, seconds=SECONDS, pause=0.0) for n, (ahead, rate) in speeds.items()}
     cells = [Cell(name, "stand", SECONDS, script, window=0.0) for name, script in scripts.items()]
     rollout = SuiteRollout(tracker, make_plan(cells, ROLLOUTS, 0), engine=engine, device=device)
     lab, cell = rollout.lab, rollout.plan.cell
@@ -58,15 +62,9 @@ def stand(tracker: Tracker, *, engine: str = "auto", device: str | None = None) 
     measures = rollout.outcome().measures
     height, mean, worst = float(lowest), float(error.mean()), float(error.max())
     joint = MUJOCO_JOINTS[int(error.argmax())]
-    turned, commanded = (measures[name] for name in ("speed_yaw", "ref_yaw"))
-    fell, declared = bool(measures["fell"][cell > 0].any()), "root orientation" in getattr(tracker, "ignores", ())
-    followed = 0.0 if fell else np.subtract(*_sides(turned, cell)) / np.subtract(*_sides(commanded, cell))
-    turn = "the robot falls" if fell else f"{100 * followed:.0f} % of a turn is followed"
-    turn += f", expected {100 * FOLLOWED:.0f} % or more"
-    if declared:
-        turn = "the tracker declares that it follows no orientation of the root"
-    elif followed < FOLLOWED:
-        turn += ": sign or frame of orientation, angular velocity or anchor?"
+    turn = _followed("turn", measures, cell, 1, "yaw", "orientation, angular velocity or anchor")
+    if "root orientation" in getattr(tracker, "ignores", ()):
+        turn = CheckResult("turn", True, "the tracker declares that it follows no orientation of the root")
     fault = "" if height >= HEIGHT else ": gains, action scale, joint order, or sign of a measurement?"
     near = (
         f"{mean:.3f} rad from the reference on average, expected {JOINT_ERROR:g} or less; most {joint}, {worst:.2f} rad"
@@ -74,10 +72,19 @@ def stand(tracker: Tracker, *, engine: str = "auto", device: str | None = None) 
     return [
         CheckResult("pelvis", height >= HEIGHT, f"{height:.2f} m at its lowest, expected {HEIGHT:g} m or more{fault}"),
         CheckResult("joints", mean <= JOINT_ERROR and worst <= WORST, f"{near}, expected {WORST:g} or less"),
-        CheckResult("turn", declared or followed >= FOLLOWED, turn),
+        turn,
+        _followed("walk", measures, cell, 3, "x", "the commanded velocity, or order of the commanded joints"),
     ]
 
 
-def _sides(speed: np.ndarray, cell: np.ndarray) -> tuple[float, float]:
-    """Mean speed of the turns to the left and to the right."""
-    return float(speed[cell == 1].mean()), float(speed[cell == 2].mean())
+def _followed(
+    name: str, measures: dict[str, np.ndarray], cell: np.ndarray, first: int, axis: str, suspects: str
+) -> CheckResult:
+    """Part of a motion one way and the other, in two cells, that is followed."""
+    sides = [cell == first, cell == first + 1]
+    fell = bool(measures["fell"][sides[0] | sides[1]].any())
+    done, asked = (np.subtract(*(measures[f"{of}_{axis}"][side].mean() for side in sides)) for of in ("speed", "ref"))
+    followed = 0.0 if fell else float(done / asked)
+    said = "the robot falls" if fell else f"{100 * followed:.0f} % of a {name} is followed"
+    fault = "" if followed >= FOLLOWED[name] else f": sign or frame of {suspects}?"
+    return CheckResult(name, not fault, f"{said}, expected {100 * FOLLOWED[name]:.0f} % or more{fault}")

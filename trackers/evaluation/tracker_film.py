@@ -26,10 +26,10 @@ PICTURES = 10
 """Pictures per strip."""
 WIDTH, HEIGHT = 256, 256
 SHOWN = {"walk 0.6": (0.0, 5.0), "ball, standing kick": (0.5, 4.0), "squat 0.45": (0.0, 7.0), "sit 0.42": (0.0, 12.0)}
-SHOWN[push_suite.RAMP] = (0.0, 60.0)
+SHOWN[push_suite.RAMP] = (0.0, 59.9)
 """Part of each rollout that is shown [s]."""
 VIEWS = {"walk 0.6": (1.2, 4.6), "ball, standing kick": (0.4, 2.6), "squat 0.45": (0.1, 2.6), "sit 0.42": (-0.1, 2.6)}
-VIEWS[push_suite.RAMP] = (0.8, 6.5)
+VIEWS[push_suite.RAMP] = (0.8, 5.0)
 """Middle of the picture along the robot's path and distance of the camera to its right [m]."""
 EYE, GAZE = 1.05, 0.72
 """Heights of the camera and of its target [m]."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import tyro
 
@@ -34,12 +35,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
         check(options)  # before the libraries are loaded
         from arena_newton.cli.quiet import quiet_warp
-        from arena_newton.trackers.train.session import train
 
+        with without_wandb(options.logger):
+            from arena_newton.trackers.train.session import train
         quiet_warp()
         train(options)
 
     return exit_code(work)
+
+
+@contextlib.contextmanager
+def without_wandb(logger: str) -> Iterator[None]:
+    """Import rsl_rl without the package wandb, an eighth of the imports, unless it is the logger or there already."""
+    hidden = logger != "wandb" and "wandb" not in sys.modules
+    if hidden:
+        sys.modules["wandb"] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        if hidden:
+            del sys.modules["wandb"]
 
 
 def _export(arguments: Sequence[str]) -> None:

@@ -22,7 +22,7 @@ from arena_newton.interfaces import Chunk
 from arena_newton.kernels import tick as codes
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
-from benchmarks.forgeries import FORGERIES, TABLES, forge, journal_lines, level_of, write_lines
+from benchmarks.audits.forgeries import FORGERIES, TABLES, forge, journal_lines, level_of, write_lines
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "3", "--repeats", "5"]
 FLAGS += ["--tracker", "twist2", "sonic"]
@@ -126,13 +126,17 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
 
 
 REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
-REPLAYED |= {"a failure made a success", "every failure made a success"}
+REPLAYED |= {"a failure made a success", "every failure made a success", "a success under the seed of a failure"}
+REPLAYED |= {"weights of trackers, with all hashes", "an environment, with its hash"}
+REPLAYED |= {"a run of an older version, and a margin"}
 LEVEL = dict.fromkeys(REPLAYED, "replay")
 LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
+LEVEL |= dict.fromkeys(("the worst group seed left out of the plan", "weights of the policy, with all hashes"), "head")
+LEVEL |= {"lines of an older version, and a success": "head", "another drive in tables and flags": "head"}
 """Means that find a forgery, where lines alone do not; the world of these tests heeds no action."""
 
 
-@pytest.mark.parametrize("name", FORGERIES)
+@pytest.mark.parametrize("name", [name for name in FORGERIES if name != "signals of a failure"])
 def test_forgeries_are_found(folder, name):
     """A forger who makes links and tables again is found by the lines, by a replay or by the published head."""
     published = json.loads((folder / "results.json").read_text())["head"]
@@ -148,7 +152,7 @@ def test_a_page_of_another_template_is_no_edited_page(folder, capsys):
     other = text.replace("<style>", "<style>p { color: red }").replace('class="', 'class="new ')
     page.write_text(other.replace("</main>", "<p>A sentence of another template.</p></main>"))
     assert main(["audit", str(folder)]) == 0
-    assert "report.html was written with another template: its figures and names" in capsys.readouterr().out
+    assert "report.html was written with another template: the figures and names in" in capsys.readouterr().out
     for old, new in ((r">\d+\.\d ", ">99.9 "), (">timeout<", ">success<")):
         page.write_text(re.sub(old, new, other, count=1))
         assert page.read_text() != other, old
@@ -172,7 +176,7 @@ class Losing(FakeEnv):
         return np.where(status == codes.SUCCESS, codes.FALL, status)
 
 
-def test_another_policys_actions_are_found(honest, capsys):
+def test_actions_of_another_policy_are_found(honest, capsys):
     """The policy is asked again at its own queries: the run's own decides as recorded, another one is found."""
     asked = ["audit", str(honest / "run"), "--replay", "6", "--draw", "7", "--policy", "stand"]
     assert main(asked, factories()) == 0
@@ -321,11 +325,18 @@ def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
     path = next((run / "episodes").glob("*repeat0000.npz"))
     with np.load(path) as stored:
         arrays = dict(stored)
-    arrays["arena_qpos"][7:, 0] += 0.05
-    np.savez_compressed(path, **arrays)
-    assert main(["audit", str(run), "--all"], parts) == 1
-    (found,) = (line for line in capsys.readouterr().out.splitlines() if "contradiction: " in line)
-    assert "the state after tick 6 is 0.05 m from what mujoco gives" in found
+    ticks = len(arrays["arena_qvel"])
+    for name, by, said in (
+        ("arena_qvel", 2.0 * (np.arange(ticks) == 7), "m/s or rad/s from what mujoco gives"),
+        ("arena_qpos", 0.003 * np.arange(ticks), "positions added up over a second from tick 0 on are 0.0"),
+        ("arena_qpos", 0.05 * (np.arange(ticks) >= 7), "positions after tick 6 are 0.05 m from what mujoco gives"),
+    ):
+        forged = {name: arrays[name].copy(), "arena_final_qpos": arrays["arena_final_qpos"].copy()}
+        forged[name][:, 0] += by
+        forged["arena_final_qpos"][0] += by[-1] * (name == "arena_qpos")
+        np.savez_compressed(path, **arrays | forged)
+        assert main(["audit", str(run), "--all"], parts) == 1
+        assert said in capsys.readouterr().out
     for ticks, code in ((6, 1), (0, 2)):
         few = {name: arrays[name][:ticks] for name in ("arena_qpos", "arena_qvel")}
         np.savez_compressed(path, **arrays | few | {"arena_final_qpos": arrays["arena_qpos"][ticks]})

@@ -125,7 +125,8 @@ def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
     assert code == 0, said
     weights = lines[0]["hashes"]["checkpoint"]
     board, page = ((site / name).read_text() for name in ("index.html", "ours.html"))
-    assert f"<small>drive humanoidarena, fast physics, other weights {weights}</small>" in board and weights in page
+    unusual = f"drive humanoidarena, fast physics, seeds 0, 9 repeats of each, other weights {weights}"
+    assert f"<small>{unusual}</small>" in board and weights in page
     outcomes = {line["outcome"] for line in lines}
     shown = Page(site / "ours.html").addresses
     pictures = {path for path in shown if path.endswith(".jpg")}
@@ -193,6 +194,14 @@ def relinked(members, lines):
     members["episodes.jsonl"] = b"".join(texts)
 
 
+def older(members):
+    """Lines said to be of a version that neither linked nor hashed them."""
+    lines = [json.loads(line) | {"schema": 2} for line in members["episodes.jsonl"].splitlines()]
+    gone = ("previous", "actions", "final_state", "shown")
+    texts = (json.dumps({key: value for key, value in line.items() if key not in gone}) for line in lines)
+    members["episodes.jsonl"] = "".join(f"{text}\n" for text in texts).encode()
+
+
 def unfinished(members):
     """Failures left out of a run that is said to be cancelled."""
     lines = [json.loads(line) for line in members["episodes.jsonl"].splitlines()]
@@ -205,6 +214,7 @@ def unfinished(members):
     ("edit", "named"),
     [
         (lambda entry: repacked(entry, won), "head is"),
+        (lambda entry: repacked(entry, older), "a version without chain wrote its lines"),
         (lambda entry: repacked(entry, unfinished), "of 16 episodes; rates are of whole plans"),
         (lambda entry: repacked(entry, lambda m: m.update({sorted(m)[0]: b"x" * 99})), "contradiction"),
         (lambda entry: (entry / "bundle.zip").write_bytes(b"other"), "SHA-256 is"),
@@ -212,7 +222,7 @@ def unfinished(members):
         (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
         (lambda entry: fill(entry, numbers="paper", rows=["act"]), "numbers of paper are not those of its bundle"),
     ],
-    ids=["outcome", "unfinished", "actions", "bytes", "trackers", "weights", "numbers"],
+    ids=["outcome", "older", "unfinished", "actions", "bytes", "trackers", "weights", "numbers"],
 )
 def test_an_edited_result_is_found(entry, edit, named, capsys):
     """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""

@@ -87,6 +87,7 @@ def test_max_steps_caps_the_budget():
         (("boxing",), {"modes": ("night",)}, "--mode night"),
         (("boxing",), {"modes": ()}, "--mode: nothing given"),
         (("boxing",), {"trackers": ("pd", "pd")}, "--tracker pd: given twice"),
+        (("boxing",), {"trackers": ("own:a+b", "own:a=b")}, "two have one name as a folder"),
         (("boxing",), {"seeds": (1, 1)}, "--seeds 1: given twice"),
         (("boxing",), {"repeats": 0}, "--repeats 0"),
         (("boxing",), {"rules": "mine"}, "--rules mine"),

@@ -1,6 +1,9 @@
 """Methods of rsl_rl that are overridden here: when a signature moves, the override must be read again."""
 
+import importlib
 import inspect
+import sys
+from types import ModuleType
 
 import pytest
 from rsl_rl.algorithms import PPO
@@ -10,6 +13,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.logger import Logger
 
+from arena_newton.trackers.train.__main__ import without_wandb
 from arena_newton.trackers.train.logger import DeviceLogger
 from arena_newton.trackers.train.model import TrackerActor, TrackerCritic, UncheckedGaussian
 from arena_newton.trackers.train.ppo import TrackerPPO
@@ -65,3 +69,16 @@ def test_an_overridden_method_has_the_signature_that_was_overridden(theirs, name
     """Upstream's parameters are those of the version that the override was written for."""
     parameters = " ".join(inspect.signature(getattr(theirs, name)).parameters)
     assert parameters == UPSTREAM[f"{theirs.__name__}.{name}"]
+
+
+def test_only_the_start_of_a_training_goes_without_wandb(monkeypatch):
+    """rsl_rl is imported without wandb, unless it is the logger or there already; afterwards it can be imported."""
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    with without_wandb("tensorboard"), pytest.raises(ModuleNotFoundError):
+        importlib.import_module("wandb")
+    assert "wandb" not in sys.modules
+    with without_wandb("wandb"):
+        assert "wandb" not in sys.modules
+    monkeypatch.setitem(sys.modules, "wandb", there := ModuleType("wandb"))
+    with without_wandb("tensorboard"):
+        assert importlib.import_module("wandb") is there

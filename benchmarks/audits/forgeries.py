@@ -1,4 +1,4 @@
-"""``python -m benchmarks forgeries``: a results folder forged in fifty ways, and what of an audit finds each.
+"""``python -m benchmarks forgeries``: a results folder forged in some seventy ways, and what of an audit finds each.
 
 The forger knows the format: links and tables are made again after each change.
 """
@@ -13,6 +13,7 @@ import io
 import json
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.audit.action_replay import drawn, replay
@@ -27,12 +29,14 @@ from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.run import run as evaluate
 from arena_newton.eval.folders.results import load_run
-from arena_newton.eval.folders.run_folder import stored_options
+from arena_newton.eval.folders.run_folder import comparable, stored_options
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.document import CONFIG_FILE
+from arena_newton.eval.records.identity import config_hash
 from arena_newton.eval.records.journal import JOURNAL_FILE
 from arena_newton.eval.reports import report
 from arena_newton.files.untrusted_files import array_digest
+from arena_newton.trackers.base import Tracker
 from benchmarks.bench_options import ForgeryOptions
 
 __all__ = ["FORGERIES", "PLAYED", "TABLES", "forge", "forgery_figures", "journal_lines", "level_of"]
@@ -97,6 +101,95 @@ def document(folder: Path, **changes: Any) -> Line:
     if changes:
         path.write_text(json.dumps(content, indent=2) + "\n")
     return content
+
+
+def claimed(*, of_lines: Forgery = lambda folder, lines: None, **changes: Any) -> Forgery:
+    """Forgery of the configuration, whose hash is made again in it and in all lines, after changes of the lines."""
+
+    def change(folder: Path, lines: list[Line]) -> None:
+        hashed = config_hash(document(folder, **changes)["config"])
+        document(folder, config_hash=hashed)
+        of_lines(folder, lines)
+        for line in lines:
+            line["hashes"]["config"] = hashed
+
+    return change
+
+
+def other_weights(folder: Path, lines: list[Line]) -> None:
+    """The trackers' weights under another hash, in the configuration and in every line."""
+    names = document(folder)["config"]["checkpoint"]
+    claimed(config__checkpoint=dict.fromkeys(names, "0" * 12))(folder, lines)
+    for line in lines:
+        line["hashes"]["checkpoint"] = "0" * 12
+
+
+def other_policy_file(folder: Path, lines: list[Line]) -> None:
+    """The weights of the policy under another hash."""
+    for line in lines:
+        line["hashes"]["policy"] = "0" * 12
+
+
+def other_environment(folder: Path, lines: list[Line]) -> None:
+    """Physics of another rate, in the configuration and in every line."""
+    environments = document(folder)["environments"]
+    for facts in environments.values():
+        facts["physics_dt"] = 0.002
+    document(folder, environments=environments)
+    for line in lines:
+        facts = environments[f"{line['task']} {line['tracker']} {line['mode']}"]
+        line["hashes"]["environment"] = config_hash(comparable(facts))
+
+
+def other_drive(folder: Path, lines: list[Line]) -> None:
+    """Other gains of the joints, in configuration and flags alike."""
+    claimed(config__drive="humanoidarena", options__drive="humanoidarena")(folder, lines)
+
+
+def other_signals(folder: Path, lines: list[Line]) -> None:
+    """A failure that a tracker's legs are said to have caused."""
+    for line in lines:
+        if line["outcome"] != "success" and line.get("signals"):
+            line["signals"] |= {"tracking_error": 0.2, "tracking_worst": 0.3}
+            return
+    raise InputError("the folder has no failure with signals (--failures)")
+
+
+def seed_dropped(folder: Path, lines: list[Line]) -> None:
+    """The worst group seed left out of the plan."""
+    seeds = document(folder)["config"]["seeds"]
+    if len(seeds) < 2:
+        raise InputError("the folder has one group seed")
+    won = Counter(line["group_seed"] for line in lines if line["outcome"] == "success")
+    kept = [seed for seed in seeds if seed != min(seeds, key=lambda seed: won[seed])]
+    lines[:] = [line for line in lines if line["group_seed"] in kept]
+    ranked = {index: number for number, index in enumerate(sorted(line["index"] for line in lines))}
+    for line in lines:
+        line["index"] = ranked[line["index"]]
+    claimed(config__seeds=kept, options__seeds=kept, planned=len(lines))(folder, lines)
+
+
+def downgraded(folder: Path, lines: list[Line]) -> None:
+    """Lines said to be of a version without chain and hashes, and a failure made a success."""
+    won(first(lines, "timeout"))
+    for line in lines:
+        line["schema"] = 2
+        for key in ("actions", "final_state", "shown", "previous"):
+            line.pop(key, None)
+
+
+def copied_success(folder: Path, lines: list[Line]) -> None:
+    """A failure replaced by a success of its task: result, actions and hashes, under the failure's own seeds."""
+    lost = first(lines, "timeout")
+    alike = [line for line in lines if line["outcome"] == "success" and line["task"] == lost["task"]]
+    if not alike:
+        raise InputError(f"the folder has no success in {lost['task']}")
+    kept = "index tracker mode group_seed repeat episode_seed object_seed media started_at finished_at".split()
+    with np.load(folder / alike[0]["media"]["actions"]) as stored:
+        arrays = dict(stored) | {"episode_seed": np.asarray(np.int64(lost["episode_seed"]))}
+    np.savez_compressed(folder / lost["media"]["actions"], **arrays)
+    lost |= {key: value for key, value in alike[0].items() if key not in kept}
+    lost["actions"] = array_digest(arrays)
 
 
 def dropped(folder: Path, lines: list[Line]) -> None:
@@ -228,6 +321,19 @@ FORGERIES: dict[str, Forgery] = TABLES | {
     "every failure made a success": all_won,
     "final state": edited("success", final_state="0" * 64),
     "what the policy was shown": edited("success", shown="0" * 64),
+    "another drive in the tables": claimed(config__drive="humanoidarena"),
+    "another drive in tables and flags": other_drive,
+    "a variant that was not played": claimed(config__variant="0" * 12),
+    "weights of trackers, with all hashes": other_weights,
+    "an environment, with its hash": other_environment,
+    "signals of a failure": other_signals,
+    "the worst group seed left out of the plan": seed_dropped,
+    "weights of the policy, with all hashes": claimed(config__policy_file="0" * 12, of_lines=other_policy_file),
+    "lines of an older version, and a success": downgraded,
+    "a run of an older version, and a margin": claimed(
+        config__version="0.0.1", of_lines=edited("success", margin=lambda line: line["margin"] + 0.01)
+    ),
+    "a success under the seed of a failure": copied_success,
 }
 """Forgeries by name; links, and tables but for `TABLES`, are made again after each."""
 
@@ -286,14 +392,32 @@ def level_of(
 
 
 class TeleportingWorld(ArenaEnv):
-    """A world whose robot is half a metre further on at the end of its first second."""
+    """A world whose robot is half a metre further on at the end of a tick, by default that of its first second."""
+
+    at = 50
+    """The tick; those of the start-up are negative."""
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:
         """Advance, and teleport."""
         status = super().step(action, worlds)
-        for world in np.flatnonzero(self.tick == 50):
+        for world in np.flatnonzero(self.tick == self.at):
             self.physics.data[world].qpos[self.scene.robot.root_qpos] += 0.5  # type: ignore[union-attr]
         return status
+
+
+class EarlyTeleportingWorld(TeleportingWorld):
+    """One that does so in the start-up, before the policy acts."""
+
+    at = -5
+
+
+class LightWorld(ArenaEnv):
+    """A world whose gravity lacks three of a hundred parts."""
+
+    def __init__(self, *arguments: Any, **options: Any):
+        """Build it."""
+        super().__init__(*arguments, **options)
+        self.physics.model.opt.gravity[2] *= 0.97  # type: ignore[union-attr]
 
 
 def played_again(folder: Path, out: Path, factories: Factories | None = None, **changes: Any) -> None:
@@ -315,9 +439,21 @@ def under_the_name_of(honest: Path, folder: Path) -> None:
     report.write_reports(load_run(folder))
 
 
-def teleported(honest: Path, out: Path) -> None:
-    """The plan of a folder played in a world that teleports."""
-    played_again(honest, out, Factories(env=TeleportingWorld))
+def in_world(kind: type[ArenaEnv]) -> Callable[[Path, Path], None]:
+    """Forgery that plays the plan of a folder in another world."""
+    return lambda honest, out: played_again(honest, out, Factories(env=kind))
+
+
+def with_other_weights(honest: Path, out: Path) -> None:
+    """The plan of a folder played through trackers whose targets are 1 % larger, under the hashes of the run's."""
+
+    def stronger(spec: str, checkpoint: Path | None) -> Tracker:
+        one = trackers.get(spec, checkpoint)
+        step = one.step
+        one.step = lambda *given: step(*given) * 1.01  # type: ignore[method-assign]
+        return one
+
+    played_again(honest, out, Factories(tracker=stronger))
 
 
 def disguised(honest: Path, out: Path) -> None:
@@ -326,7 +462,13 @@ def disguised(honest: Path, out: Path) -> None:
     under_the_name_of(honest, out)
 
 
-PLAYED = {"a world that teleports": teleported, "an expert under the policy's name": disguised}
+PLAYED = {
+    "a world that teleports": in_world(TeleportingWorld),
+    "a world that teleports in the start-up": in_world(EarlyTeleportingWorld),
+    "a world with 3 % less gravity": in_world(LightWorld),
+    "trackers of other weights": with_other_weights,
+    "an expert under the policy's name": disguised,
+}
 """Forgeries whose episodes are played, by name: of the honest folder, into another; their head is the published one."""
 
 

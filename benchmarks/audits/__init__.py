@@ -1,0 +1,1 @@
+"""Measurements of audits: what they find in forged folders, and what they say of honest ones."""

@@ -1,0 +1,253 @@
+"""Commands of a plan: every recording, dataset, training, suite, table and card as a command of its own.
+
+A command is known to be done by what its folder holds, and continues by itself what an earlier one left there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from arena_newton import tasks
+from arena_newton.cli.flags import words
+from arena_newton.data.datasets.data_options import BuildOptions
+from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow, policy_name, suite_text
+from arena_newton.eval.loop.stage_state import played, succeeded, trained
+from arena_newton.eval.records.document import CONFIG_FILE
+from arena_newton.eval.records.journal import write_atomic
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
+
+__all__ = ["STAGES", "PlanCommand", "PlanFolders", "plan_commands"]
+
+STAGES = ("record", "build", "train", "evaluate", "tables", "card")
+"""Stages in their order."""
+EVAL, TRAIN = "arena_newton.eval", "arena_newton.policies.train"
+ALL_GPUS = -1
+"""Number of GPUs of a command that divides those of the machine itself."""
+
+
+@dataclass(frozen=True)
+class PlanFolders:
+    """Folders of a plan that is played."""
+
+    out: Path
+
+    def recordings(self, task: str, tracker: str, parts: int) -> list[Path]:
+        """Recordings of a pair."""
+        name = self.out / "demonstrations" / f"{task}_{tracker}"
+        return [name] if parts == 1 else [name.with_name(f"{name.name}_{part}") for part in range(1, parts + 1)]
+
+    def dataset(self, task: str, tracker: str) -> Path:
+        """Dataset of a pair."""
+        return self.out / "datasets" / f"{task}_{tracker}"
+
+    def training(self, row: PlanRow, seed: int) -> Path:
+        """A training."""
+        return self.out / "trainings" / f"{row.name}_{seed}"
+
+    def suite(self, row: PlanRow) -> Path:
+        """The suite of a row; its file is beside it."""
+        return self.out / "evaluation" / row.name
+
+    def trained(self, row: PlanRow) -> list[int]:
+        """Seeds of the trainings of a row that are whole."""
+        found = sorted(int(path.name.rpartition("_")[2]) for path in self.out.glob(f"trainings/{row.name}_[0-9]*"))
+        return [seed for seed in found if trained(self.training(row, seed))]
+
+    @property
+    def tables(self) -> Path:
+        """Tables of all suites."""
+        return self.out / "tables"
+
+    @property
+    def packed(self) -> Path:
+        """The packed policy of the first row."""
+        return self.out / "packed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanCommand:
+    """A command of a stage."""
+
+    stage: str
+    name: str
+    words: Callable[[], Sequence[str]]
+    """Module and command line, made when it begins: those that continue what is there."""
+    done: Callable[[], bool] = lambda: False
+    after: tuple[str, ...] = ()
+    """Commands that must be done before."""
+    gpus: int = 0
+    """GPUs that it takes."""
+    size: float = 0.0
+    """The larger of two commands begins first."""
+
+    def __str__(self) -> str:
+        """Stage and name."""
+        return f"{self.stage} {self.name}".strip()
+
+
+def plan_commands(
+    plan: LoopPlan,
+    folders: PlanFolders,
+    *,
+    rows: Sequence[PlanRow],
+    seeds: Sequence[int],
+    device: str | None,
+    gpus: int,
+    minutes: Callable[[], float],
+    middle: Callable[[PlanRow], int],
+) -> list[PlanCommand]:
+    """All commands of a plan, each after those that it needs.
+
+    Args:
+        plan: The plan.
+        folders: Where it is played.
+        rows: Its rows that are trained.
+        seeds: Seeds of the trainings of each row.
+        device: Device of all commands; None: the best there is.
+        gpus: GPUs of this machine.
+        minutes: Time of a training that begins now [min].
+        middle: Seed of the training of a row that is packed.
+    """
+    found: list[PlanCommand] = []
+    trackers = plan.record.tracker or ("twist2",)
+    for task, tracker in itertools.product(plan.attempts, trackers):
+        found += _demonstrations(plan, folders, task, tracker, device)
+    for row in rows:
+        datasets = tuple(folders.dataset(*pair) for pair in itertools.product(plan.attempts, row.trackers))
+        each = max(1, min(plan.settings.gpus, gpus))
+        for seed in seeds:
+            folder = folders.training(row, seed)
+            options = dataclasses.replace(
+                row.train, dataset=datasets, out=folder, seed=seed, device=device or row.train.device
+            )
+            found.append(
+                PlanCommand(
+                    stage="train",
+                    name=folder.name,
+                    words=partial(_trained, options, minutes, each, gpus),
+                    done=partial(trained, folder),
+                    after=tuple(f"build {dataset.name}" for dataset in datasets),
+                    gpus=each,
+                )
+            )
+        found.append(
+            PlanCommand(
+                stage="evaluate",
+                name=row.name,
+                words=partial(_evaluated, plan, folders, row, seeds, device, gpus),
+                done=partial(played, folders.suite(row), {policy_name(row, seed) for seed in seeds}),
+                after=tuple(f"train {folders.training(row, seed).name}" for seed in seeds),
+                gpus=ALL_GPUS,
+            )
+        )
+    tables = [EVAL, "tables", *(str(folders.suite(row)) for row in rows), "--out", str(folders.tables)]
+    found.append(
+        PlanCommand(
+            stage="tables",
+            name="",
+            words=partial(list, [*tables, "--format", "md", "tex", "csv"]),
+            after=tuple(f"evaluate {row.name}" for row in rows),
+        )
+    )
+    first = plan.rows[0]
+    if first in rows and first.train.policy == "act":  # other families are not packed
+        card = partial(_packed, plan, folders, first, middle)
+        found.append(PlanCommand(stage="card", name=first.name, words=card, after=("tables",)))
+    return found
+
+
+def _demonstrations(
+    plan: LoopPlan, folders: PlanFolders, task: str, tracker: str, device: str | None
+) -> list[PlanCommand]:
+    """Recordings of a pair, and the dataset that is built of them."""
+    parts, dataset = plan.parts.get(task, 1), folders.dataset(task, tracker)
+    sets = folders.recordings(task, tracker, parts)
+    build = words(BuildOptions(out=dataset, only_success=not plan.settings.failures_too))
+    attempts = plan.attempts[task]
+    recorded = [
+        PlanCommand(
+            stage="record",
+            name=folder.name,
+            words=partial(_recorded, _recording(plan, task, tracker, f"{number}/{parts}", folder, device), folder),
+            done=partial(succeeded, folder),
+            gpus=1,
+            size=attempts * tasks.get(task).steps.paper / parts,
+        )
+        for number, folder in enumerate(sets, 1)
+    ]
+    built = PlanCommand(
+        stage="build",
+        name=dataset.name,
+        words=partial(list, ["arena_newton.data", "build", *map(str, sets), *build]),
+        done=dataset.is_dir,
+        after=tuple(map(str, recorded)),
+    )
+    return [*recorded, built]
+
+
+def _recording(plan: LoopPlan, task: str, tracker: str, part: str, folder: Path, device: str | None) -> list[str]:
+    """Flags of a recording."""
+    attempts, parts = plan.attempts[task], int(part.partition("/")[2])
+    options = dataclasses.replace(
+        plan.record,
+        task=(task,),
+        tracker=(tracker,),
+        episodes=attempts,
+        worlds=-(-attempts // parts) if plan.at_once else plan.record.worlds,
+        shard=part if parts > 1 else None,
+        out=str(folder),
+        device=device or plan.record.device,
+    )
+    return words(options)
+
+
+def _recorded(flags: Sequence[str], folder: Path) -> list[str]:
+    """Begin a recording, or go on with it."""
+    if (folder / CONFIG_FILE).is_file():
+        return [EVAL, "resume", str(folder)]
+    return [EVAL, "record", *flags]
+
+
+def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: int, gpus: int) -> list[str]:
+    """Begin a training, or go on with it."""
+    folder = options.out
+    assert folder is not None
+    jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // max(1, gpus))
+    if (folder / "checkpoints" / "last").exists():
+        options = PolicyTrainOptions(resume=folder, device=options.device, compile=options.compile)
+    else:
+        shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint
+        options = dataclasses.replace(options, minutes=0.0 if options.steps else minutes())
+    command = [TRAIN, *words(dataclasses.replace(options, jobs=jobs, quiet=True))]
+    if each == 1:
+        return command
+    return ["torch.distributed.run", "--standalone", "--nproc-per-node", str(each), "-m", *command]
+
+
+def _evaluated(
+    plan: LoopPlan, folders: PlanFolders, row: PlanRow, seeds: Sequence[int], device: str | None, gpus: int
+) -> list[str]:
+    """Play the trainings of a row: those of this call, and others that are there."""
+    seeds = sorted({*seeds, *folders.trained(row)})
+    suite = folders.suite(row)
+    file = suite.with_suffix(".toml")
+    file.parent.mkdir(exist_ok=True)
+    write_atomic(file, suite_text(plan, row, {seed: folders.training(row, seed) for seed in seeds}))
+    jobs = ["--jobs", str(plan.settings.cells * max(1, gpus))]
+    return [EVAL, "matrix", str(file), "--out", str(suite), *jobs, *(["--device", device] if device else [])]
+
+
+def _packed(plan: LoopPlan, folders: PlanFolders, row: PlanRow, middle: Callable[[PlanRow], int]) -> list[str]:
+    """Pack a training; cells whose budgets were cut are no results, and are not in its card."""
+    suite = str(folders.suite(row))
+    results = [] if plan.evaluate.get("max_steps") else ["--results", suite]
+    others = ["--trainings", suite] if results and len(folders.trained(row)) > 1 else []
+    packed = ["pack", str(folders.training(row, middle(row))), "--out", str(folders.packed)]
+    return [EVAL, *packed, "--tasks", *plan.attempts, *results, *others]

@@ -1,0 +1,198 @@
+"""Plans of `eval loop --plan`: what their tables say, what is refused, and the commands that are made of them."""
+
+import pytest
+from made_suites import cell_of, outcomes, write_suite
+
+from arena_newton.errors import InputError
+from arena_newton.eval.__main__ import main
+from arena_newton.eval.loop import plan_report
+from arena_newton.eval.loop.plan_commands import PlanFolders, plan_commands
+from arena_newton.eval.loop.plan_file import SHIPPED, read_plan, suite_text
+from arena_newton.eval.loop.plan_loop import training_minutes
+from arena_newton.eval.suites.matrix_cells import expand_cells
+from arena_newton.eval.suites.suite_file import read_suite_file
+
+
+def made(plan, out, **changes):
+    """Commands of a plan by their names."""
+    given = {"rows": [plan.rows[0]], "seeds": [1, 2, 3], "device": None, "gpus": 4, "minutes": lambda: 9.0}
+    given |= {"middle": lambda row: 2} | changes
+    return {str(command): command for command in plan_commands(plan, PlanFolders(out), **given)}
+
+
+def cells_of(plan, name, tmp_path):
+    """Cells of a row's suite with three trainings."""
+    (tmp_path / "suite.toml").write_text(suite_text(plan, plan.row(name), dict.fromkeys((1, 2, 3), tmp_path / "x")))
+    return expand_cells(read_suite_file(tmp_path / "suite.toml"))
+
+
+def test_the_generalist_plays_every_cell(tmp_path):
+    """Three trainings on 14 pairs in six modes; a network of one tracker is swapped in base mode alone."""
+    plan = read_plan("generalist")
+    cells = cells_of(plan, "all", tmp_path)
+    assert len(cells) == 3 * 14 * 6 and {cell.episodes for cell in cells} == {60}
+    assert {cell.policy for cell in cells} == {"all#1", "all#2", "all#3"}
+    assert {(cell.tracker, cell.mode) for cell in cells_of(plan, "twist2", tmp_path)} == {
+        ("twist2", "base"),
+        ("sonic", "base"),
+    }
+    swapped = [cell for cell in cells_of(read_plan("tiny"), "own", tmp_path) if cell.tracker not in cell.trained_on]
+    assert {cell.mode for cell in swapped} == {"base"}
+
+
+def test_rows_of_the_generalist_are_its_ablation():
+    """Each row differs from the first by what its name says, and all take the same demonstrations, steps and time."""
+    plan = read_plan("generalist")
+    first, *others = plan.rows
+    differ = {
+        row.name: {name for name, value in vars(row.train).items() if value != getattr(first.train, name)}
+        for row in others
+    }
+    expected = {"none": {"looks", "recipe_values"}, "augmentation": {"looks"}, "shapes": {"look_changes"}}
+    expected |= {"light": {"look_changes"}, "plain-02": {"looks"}, "plain-06": {"looks"}, "untold": {"tracker_vector"}}
+    assert differ == expected | {"twist2": set(), "sonic": set()}
+
+
+def test_commands_are_those_of_the_house(tmp_path):
+    """Sets, datasets, trainings, suite, tables and card, each after those that it needs, the largest first."""
+    plan = read_plan("generalist")
+    commands = made(plan, tmp_path)
+    stages = [command.stage for command in commands.values()]
+    assert {stage: stages.count(stage) for stage in stages} == {
+        **{"record": 18, "build": 14, "train": 3},
+        **{"evaluate": 1, "tables": 1, "card": 1},
+    }
+    one = commands["record double_desk_sonic_2"]
+    text = " ".join(one.words())
+    assert text.startswith("arena_newton.eval record --task double_desk --tracker sonic ")
+    assert "--episodes 180" in text and "--worlds 90" in text and "--shard 2/2" in text and "--looks 1" in text
+    assert one.size == 180 * 2000 / 2
+    assert commands["build double_desk_sonic"].after == ("record double_desk_sonic_1", "record double_desk_sonic_2")
+    train = commands["train all_2"]
+    text = " ".join(train.words())
+    assert text.count(str(tmp_path / "datasets")) == 14 == len(train.after) and train.gpus == 1
+    assert "--minutes 9.0" in text and "--seed 2" in text and "--looks 0.6 double_desk=0.3" in text
+    assert commands["evaluate all"].after == ("train all_1", "train all_2", "train all_3")
+    (tmp_path / "evaluation").mkdir()
+    assert commands["evaluate all"].words()[-2:] == ["--jobs", "56"]
+    assert commands["card all"].words()[:3] == ["arena_newton.eval", "pack", str(tmp_path / "trainings/all_2")]
+    assert not any(command.done() for command in commands.values())
+
+
+def test_what_is_there_is_continued(tmp_path):
+    """A recording by `eval resume`, a training by --resume; one without a checkpoint begins again."""
+    commands = made(read_plan("generalist"), tmp_path)
+    sets = tmp_path / "demonstrations" / "boxing_twist2"
+    sets.mkdir(parents=True)
+    (sets / "config.json").write_text("{}")
+    assert list(commands["record boxing_twist2"].words()) == ["arena_newton.eval", "resume", str(sets)]
+    training = tmp_path / "trainings" / "all_1"
+    training.mkdir(parents=True)
+    (training / "half").touch()
+    assert "--resume" not in commands["train all_1"].words() and not training.exists()
+    (training / "checkpoints" / "last").mkdir(parents=True)
+    words = commands["train all_1"].words()
+    assert words[1:3] == ["--resume", str(training)] and "--minutes" not in words
+
+
+def test_several_gpus_train_one_network(tmp_path):
+    """By torchrun where the plan gives a training several, as many as there are."""
+    text = (SHIPPED / "generalist.toml").read_text().replace("# one training on each GPU", "\ngpus = 2 #")
+    (tmp_path / "two.toml").write_text(text)
+    plan = read_plan(str(tmp_path / "two.toml"))
+    words = made(plan, tmp_path)["train all_1"].words()
+    assert words[:5] == ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
+    assert made(plan, tmp_path, gpus=1)["train all_1"].words()[0] == "arena_newton.policies.train"
+
+
+def test_trainings_have_the_time_that_recording_leaves(tmp_path):
+    """Equal parts of it, by waves of those that run at once; too little is refused."""
+    plan = read_plan("generalist")
+    line = '{{"stage": "{}", "name": "a", "began": {}, "ended": {}, "code": 0}}\n'
+    (tmp_path / "commands.jsonl").write_text(line.format("record", 0, 180) + line.format("build", 120, 240))
+    assert training_minutes(plan, None, tmp_path, 3, 4) == 12.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 4) == 24.0 - 8.0 - 4.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 6.0
+    with pytest.raises(InputError, match="^--minutes 12: recording and building took 4.0, nothing is left to train in"):
+        training_minutes(plan, 12.0, tmp_path, 3, 4)
+
+
+BAD = [
+    ("seeds = [1, 2]", "seeds = [0]", "[plan]: seeds are 0, expected numbers 1 to 9999"),
+    ("recordings = 2", 'recordings = "two"', '[plan]: recordings is "two", expected int'),
+    ("looks = 1", "lokks = 1", "[record]: --lokks: unknown argument, did you mean --looks?"),
+    ("looks = 1", "", "[[rows]] all: changes looks, and [record] has no looks"),
+    ("looks = 1", "looks = 1\nout = 'a'", "[record]: out is given by the plan, leave it out"),
+    ("boxing = 2", "boxing = 0", "[attempts]: boxing is 0, expected a number from 1"),
+    ("boxing = 2", "chess = 2", "[record]: --task chess"),
+    ("[parts]\nvis_navi", "[parts]\nfootball", "[parts]: football is none of [attempts], boxing vis_navi"),
+    ('recipe = "small"', 'recipe = "fast"', "[[rows]] all: recipe act/fast takes 224x224, and [record] has size 64x64"),
+    ('balance = "task"', 'balance = "all"', "[[rows]] all: --balance all: unknown"),
+    ('name = "own"', 'name = "all"', "[[rows]] all: expected a name of its own"),
+    ('trackers = ["twist2"]', 'trackers = ["pd"]', "[[rows]] own: trackers are pd, known are twist2 sonic"),
+    ("repeats = 2", "repeats = 0", "[evaluate]: [defaults]: --repeats 0"),
+    ("repeats = 2", "chunks = 2", "[evaluate]: [defaults]: chunks is unknown"),
+    ("[bars]", "[bar]", "bar is unknown, known are name plan record"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "says"), BAD)
+def test_an_unfit_plan_is_one_error(tmp_path, capsys, old, new, says):
+    """It names the file and the table, the code is 2, and no folder is made."""
+    text = (SHIPPED / "tiny.toml").read_text()
+    assert old in text
+    (tmp_path / "mine.toml").write_text(text.replace(old, new))
+    assert main(["loop", "--plan", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path}/mine.toml: {says}") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--plan", "mine"], "--plan mine: no such file; the package brings the plans generalist tiny"),
+        (["--plan", "tiny", "--task", "boxing"], "--task: belongs to a loop without --plan, whose file says it"),
+        (["--plan", "tiny", "--rows", "chess"], "--rows chess: "),
+        (["--plan", "tiny", "--only", "play"], "--only play: unknown, choose from record build train"),
+        (["--plan", "tiny", "--minutes", "6"], "--minutes 6: 6 are kept for decoding, evaluation and tables"),
+        (["--seeds", "1"], "--seeds: belongs to --plan, which is not given"),
+    ],
+)
+def test_unfit_flags_of_a_plan_are_refused(tmp_path, capsys, flags, says):
+    """One line that names the flag, code 2, and no folder."""
+    assert main(["loop", *flags, "--out", str(tmp_path / "out")]) == 2
+    assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_folder_is_of_one_plan(tmp_path, capsys):
+    """A stage without those before it, another plan, and a folder of something else are refused."""
+    flags = ["loop", "--plan", "tiny", "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main([*flags, "--only", "train"]) == 2
+    assert "--only train: train all_1 needs build boxing_twist2, which is not done" in capsys.readouterr().err
+    flags[2] = "generalist"
+    assert main(flags) == 2 and "was begun with another plan" in capsys.readouterr().err
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "file").touch()
+    flags[-1] = str(tmp_path / "else")
+    assert main(flags) == 2 and "is not empty and holds no plan" in capsys.readouterr().err
+
+
+def test_the_page_has_the_middle_of_the_trainings_and_their_bars(tmp_path):
+    """All successes are printed, bars are held by the training in the middle, missed ones are named by cell."""
+    plan = read_plan("generalist")
+    folders = PlanFolders(tmp_path)
+    cells = []
+    for seed, won in ((1, 60), (2, 50), (3, 57)):
+        for tracker, less in (("twist2", 0), ("sonic", 7)):
+            for mode in ("base", "visual"):
+                cell = cell_of(f"all#{seed}", "act", tracker, "boxing", trained_on=("twist2", "sonic"), mode=mode)
+                cells.append((cell, outcomes(won - less)))
+    write_suite(folders.suite(plan.rows[0]), cells)
+    assert plan_report.middle_seed(folders.suite(plan.rows[0])) == 3
+    said = plan_report.write(plan, folders, [], "a command")
+    assert "all: base: 107 of 120 (113 93 107) missed" in said and "all: visual: 107 of 120 (113 93 107) missed" in said
+    assert "all: under its bar: boxing sonic base: 50 of 60, bar 54" in said
+    assert not any("visual: 50" in line or "twist2" in line for line in said)
+    page = (tmp_path / "plan.md").read_text()
+    assert "| boxing | twist2 | 60 50 57 | 60 50 57 |" in page and "Seeds of its trainings: 1 2 3." in page
