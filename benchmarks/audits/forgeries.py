@@ -424,7 +424,8 @@ class LightWorld(ArenaEnv):
     def __init__(self, *arguments: Any, **options: Any):
         """Build it."""
         super().__init__(*arguments, **options)
-        self.physics.model.opt.gravity[2] *= 0.97  # type: ignore[union-attr]
+        for data in self.physics.data:  # type: ignore[union-attr]
+            data.model.opt.gravity[2] = -9.516
 
 
 def played_again(folder: Path, out: Path, factories: Factories | None = None, **changes: Any) -> None:

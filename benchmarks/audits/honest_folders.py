@@ -22,6 +22,7 @@ from arena_newton import policies, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.bench.timing import BenchFigure
+from arena_newton.eval.plan.options import QUICK_TRACKERS
 from arena_newton.eval.play.env_cache import CachedEnv, EnvCache
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.records.journal import JOURNAL_FILE
@@ -123,7 +124,7 @@ def flags_of_a_run(chance: random.Random, task: str, late: bool) -> list[str]:
     flags = ["--task", task, "--engine", "mujoco", "--max-steps", str(chance.choice(SHORT)), "--worlds", "2"]
     flags += ["--seeds", *map(str, chance.sample(range(100), chance.choice((1, 1, 2))))]
     flags += ["--repeats", str(chance.choice((2, 3))), "--policy", chance.choice(("expert", "stand"))]
-    flags += ["--tracker", *chance.choice((["twist2"], ["sonic"], ["twist2"], ["twist2", "sonic"]))]
+    flags += ["--tracker", *chance.choice((*([one] for one in QUICK_TRACKERS), QUICK_TRACKERS[:1], QUICK_TRACKERS))]
     flags += ["--mode", *chance.choice((["base"], ["base"], ["execution"], ["visual", "base"], ["dynamics"]))]
     flags += [chance.choice(("--rules=released", "--drive=humanoidarena"))] * late
     flags += ["--failures"] * (chance.randrange(3) == 0) + ["--no-actions"] * (chance.randrange(8) == 0)
