@@ -121,3 +121,6 @@ def test_finished_cells_are_not_played_again(tmp_path, capsys, monkeypatch):
     assert f"{stored[0]}: not a readable NPZ file" in capsys.readouterr().err
     with pytest.raises(InputError, match="no such file"):
         parts._read(tmp_path / "absent.npz", "mujoco", "cpu", RATE)
+    np.savez(tmp_path / "torn.npz", ticks=np.array(3))
+    with pytest.raises(InputError, match=r"torn\.npz: a kept cell without 'overflows'"):
+        parts._read(tmp_path / "torn.npz", "mujoco", "cpu", RATE)

@@ -13,6 +13,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from arena_newton import __version__
+from arena_newton.errors import InputError
 from arena_newton.files.own_files import replace_atomically
 from arena_newton.files.untrusted_files import array_digest, read_arrays
 from arena_newton.interfaces import Tracker
@@ -57,6 +59,7 @@ def play_parts(
     for i, cell in enumerate(plan.cells):
         alone, tracker = plan.only(i), make()
         facts = {"tracker": tracker.describe(), "drive": tracker.drive.as_json(), "engine": engine}
+        facts["version"] = __version__
         rate, where = tracker.rate(fast=fast_physics), "cuda" if device.startswith("cuda") else "cpu"
         facts |= {
             "device": where,
@@ -104,6 +107,8 @@ def _write(path: Path, part: Outcome) -> None:
 def _read(path: Path, engine: str, device: str, rate: PhysicsRate) -> Outcome:
     arrays = read_arrays(path)
     measures = {name.removeprefix("measure "): a for name, a in arrays.items() if name.startswith("measure ")}
+    if missing := [name for name in (*NUMBERS, "measure fell") if name not in arrays]:
+        raise InputError(f"{path}: a kept cell without {missing[0]!r}; delete the file to play the cell again")
     numbers = {name: arrays[name].item() for name in NUMBERS}
     return Outcome(measures, engine=engine, device=device, rate=rate, errors=arrays.get("errors"), **numbers)
 
