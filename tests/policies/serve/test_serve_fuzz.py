@@ -2,6 +2,7 @@
 
 import http.client
 import random
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -135,7 +136,9 @@ def test_a_client_that_sends_on_after_a_failure_is_let_go(served):
     one = served(Remembers(), "openpi")
     client = one.socket()
     client.recv(timeout=PLENTY)
-    for _ in range(3):
+    client.send(b"\xc1")
+    with suppress(ConnectionClosed):  # the server may be quicker than the second frame
+        client.send(b"\xc1")
         client.send(b"\xc1")
     assert isinstance(client.recv(timeout=PLENTY), str)
     with pytest.raises(ConnectionClosed):
