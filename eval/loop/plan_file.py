@@ -134,6 +134,14 @@ def read_plan(given: str) -> LoopPlan:
     settings = PlanSettings(**check_types(f"{path}: [plan]", _table(path, content, "plan"), PlanSettings))
     if not settings.seeds or not all(1 <= seed <= 9999 for seed in settings.seeds):
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected numbers 1 to 9999")
+    if len(set(settings.seeds)) < len(settings.seeds):
+        raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected each once")
+    least = {"minutes": 0.0, "reserve": 0.0, "gpus": 1, "recordings": 1, "datasets": 1, "cells": 1}
+    for key, low in least.items():
+        if not low <= getattr(settings, key):
+            raise InputError(f"{path}: [plan]: {key} is {getattr(settings, key)}, expected at least {low:g}")
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{path}: name is {shown(name)}, expected a text")
     record = _table(path, content, "record")
     options = _options(path, "record", record, RecordOptions)
     attempts = _numbers(path, content, "attempts")
@@ -142,7 +150,7 @@ def read_plan(given: str) -> LoopPlan:
     modes = _names(evaluate.pop("modes", ["base"]))
     plan = LoopPlan(
         path=path,
-        name=str(name),
+        name=name,
         text=path.read_bytes(),
         settings=settings,
         record=options,
@@ -151,8 +159,8 @@ def read_plan(given: str) -> LoopPlan:
         parts=parts,
         rows=_rows(path, content, options.tracker or ("twist2",), modes),
         evaluate=evaluate,
-        bars={mode: _names(value) for mode, value in _table(path, content, "bars").items()},
-        best=_table(path, content, "best"),
+        bars={mode: _rates(f"{path}: [bars]: {mode}", value) for mode, value in _table(path, content, "bars").items()},
+        best=_best(path, _table(path, content, "best")),
     )
     _check(plan)
     return plan
@@ -167,6 +175,23 @@ def _table(path: Path, content: Mapping[str, Json], key: str) -> JsonObject:
 
 def _names(value: Json) -> tuple[Json, ...]:
     return tuple(value) if isinstance(value, list) else (value,)
+
+
+def _rates(where: str, value: Json) -> tuple[float, ...]:
+    """One or two success rates."""
+    rates = _names(value)
+    if not 1 <= len(rates) <= 2 or not all(type(rate) in (int, float) and 0 <= rate <= 1 for rate in rates):
+        raise InputError(f"{where} is {shown(value)}, expected one or two rates from 0 to 1")
+    return tuple(float(rate) for rate in rates)
+
+
+def _best(path: Path, tables: JsonObject) -> dict[str, dict[str, float]]:
+    """Success rates by tracker and task."""
+    best: dict[str, dict[str, float]] = {}
+    for tracker in tables:
+        table = _table(path, tables, tracker)
+        best[tracker] = {task: _rates(f"{path}: [best]: {task}", rate)[0] for task, rate in table.items()}
+    return best
 
 
 def _numbers(path: Path, content: Mapping[str, Json], key: str) -> dict[str, Json]:
@@ -211,7 +236,7 @@ def _rows(
         options = _options(path, "train", train | flags, PolicyTrainOptions)
         mine, played = (_names(table.get(key, list(all_))) for key, all_ in (("trackers", trackers), ("modes", modes)))
         for key, values, known in (("trackers", mine, trackers), ("modes", played, modes)):
-            if not values or set(values) - set(known):
+            if not values or not all(value in known for value in values):
                 raise InputError(f"{where}: {key} are {' '.join(map(str, values))}, known are {' '.join(known)}")
         rows.append(PlanRow(name, options, mine, played))
     return tuple(rows)
@@ -225,9 +250,20 @@ def _check(plan: LoopPlan) -> None:
     """
     if not plan.attempts:
         raise InputError(f"{plan.path}: [attempts] is empty, name the tasks and their attempts")
-    for task in plan.parts:
+    for task, parts in plan.parts.items():
         if task not in plan.attempts:
             raise InputError(f"{plan.path}: [parts]: {task} is none of [attempts], {' '.join(plan.attempts)}")
+        if parts > plan.attempts[task]:
+            raise InputError(f"{plan.path}: [parts]: {task} has {parts} parts of {plan.attempts[task]} attempts")
+    played = {mode for row in plan.rows for mode in row.modes}
+    for condition in plan.bars:
+        if condition.split(",")[0] not in played:
+            raise InputError(f"{plan.path}: [bars]: {condition} is no mode that is played, {' '.join(sorted(played))}")
+    trackers = plan.record.tracker or ("twist2",)
+    for tracker, tasks in plan.best.items():
+        unknown = [tracker] if tracker not in trackers else [task for task in tasks if task not in plan.attempts]
+        if unknown:
+            raise InputError(f"{plan.path}: [best]: {unknown[0]} is none of the plan's trackers and tasks")
     where = f"{plan.path}: [record]"
     try:
         sets = dataclasses.replace(plan.record, task=tuple(plan.attempts), episodes=1)

@@ -132,6 +132,15 @@ BAD = [
     ('trackers = ["twist2"]', 'trackers = ["pd"]', "[[rows]] own: trackers are pd, known are twist2 sonic"),
     ("repeats = 2", "repeats = 0", "[evaluate]: [defaults]: --repeats 0"),
     ("repeats = 2", "chunks = 2", "[evaluate]: [defaults]: chunks is unknown"),
+    ("seeds = [1, 2]", "seeds = [1, 1]", "[plan]: seeds are 1 1, expected each once"),
+    ("recordings = 2", "recordings = 0", "[plan]: recordings is 0, expected at least 1"),
+    ("recordings = 2", "recordings = 2\nreserve = -1", "[plan]: reserve is -1"),
+    ("[parts]\nvis_navi = 2", "[parts]\nvis_navi = 3", "[parts]: vis_navi has 3 parts of 2 attempts"),
+    ("base = [0.9, 0.96]", 'base = "high"', '[bars]: base is "high", expected one or two rates from 0 to 1'),
+    ("base = [0.9, 0.96]", "bass = 0.9", "[bars]: bass is no mode that is played"),
+    ("[bars]", "[best.sonic]\nchess = 0.5\n[bars]", "[best]: chess is none of the plan's trackers and tasks"),
+    ("[bars]", "[best]\ntwist2 = 0.5\n[bars]", "twist2 is 0.5, expected a table [twist2]"),
+    ('trackers = ["twist2"]', 'trackers = [["twist2"]]', "[[rows]] own: trackers are "),
     ("[bars]", "[bar]", "bar is unknown, known are name plan record"),
 ]
 
