@@ -33,14 +33,14 @@ def main() -> None:
     ball, root = one.scene.joint_qpos(BALL), one.scene.robot.root_qpos
 
     def forward(env: ArenaEnv, values: torch.Tensor) -> torch.Tensor:
-        """How far the pelvis is [m] after the walk at factors of its displacement."""
+        """Distance of the pelvis [m] after the walk at factors of its displacement."""
         faster = torch.zeros(40).double().index_fill(0, torch.tensor([0, 1]), 1.0)
         given = plan[:, :WALK] * (1.0 + faster * (values[:, None, None] - 1.0))
         walk = differentiable.closed_loop(env, given, [SEED] * env.worlds, given.shape[1])
         return walk.qpos[-1, :, root + 1]
 
     def kicked(env: ArenaEnv, values: torch.Tensor) -> torch.Tensor:
-        """Where the ball is [m] after the kick if it starts some centimetres farther."""
+        """Position of the ball [m] after the kick if it starts some centimetres farther."""
         start = differentiable.reset_state(env, [SEED] * env.worlds)
         qpos = start.qpos.index_add(1, torch.tensor([ball + 1]), 0.01 * values[:, None])
         start = differentiable.EngineState(qpos, start.qvel, start.carried)
