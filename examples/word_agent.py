@@ -82,7 +82,7 @@ class Agent:
         if len(away) and away.min() > 0.6:
             near = paint[away < away.min() + 0.4].mean(axis=0) - here
             self.goal = here + near / np.linalg.norm(near) * (away.min() + 0.3)
-        centres = np.stack(np.indices(SHAPE), axis=2) * CELL + LOW + CELL / 2
+        centres = np.moveaxis(np.indices(SHAPE), 0, 2) * CELL + LOW + CELL / 2
         red = centres[self.blocked & (np.linalg.norm(centres - self.goal, axis=2) > 0.3)]
         gap = np.min([np.linalg.norm(centres - one, axis=2) for one in [*red, (99.0, 99.0)]], axis=0)
         cost = 1.0 + 60.0 * (gap < 0.4) + 6.0 * (gap < 0.55) + (gap < 0.7)
