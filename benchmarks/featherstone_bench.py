@@ -16,12 +16,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from arena_newton import trackers
-from arena_newton.differentiable import EngineStep
-from arena_newton.env import ArenaEnv
+from arena_newton.eval.bench.bench_gradients import standing_step
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.physics.scene import load_scene
-from arena_newton.robot.canonical import STAND_ACTION
 from arena_newton.robot.g1 import DEFAULT_POSE, MUJOCO_JOINTS, TICK
 
 __all__ = ["featherstone_figures"]
@@ -95,12 +92,7 @@ def _stand(model: newton.Model, control: newton.Control) -> None:
 
 def _implicit(worlds: int) -> tuple[float, float]:
     """Wall time of a tick of `EngineStep` per world, forward and backward [s]."""
-    env = ArenaEnv(TASK, tracker=trackers.get("twist2"), worlds=worlds, engine="mujoco", fast_physics=True)
-    env.reset(list(range(worlds)))
-    for _ in range(env.startup_ticks):
-        env.step(torch.tensor(STAND_ACTION).repeat(worlds, 1))
-    step = EngineStep(env.physics)
-    state, targets = step.state(), torch.from_numpy(env.physics.ctrl.numpy().copy()).double().requires_grad_()
+    env, step, state, targets = standing_step(TASK, worlds)
     times = []
     for _ in range(ROUNDS + 1):
         forward, after = _took(lambda: step(state, targets), "cpu")

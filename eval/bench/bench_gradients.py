@@ -10,14 +10,14 @@ from functools import partial
 import torch
 
 from arena_newton import trackers
-from arena_newton.differentiable import EngineStep, closed_loop
+from arena_newton.differentiable import EngineState, EngineStep, closed_loop
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.bench.bench_tick import as_before
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.text import counted
 from arena_newton.robot.canonical import STAND_ACTION
 
-__all__ = ["gradient_figures"]
+__all__ = ["gradient_figures", "standing_step"]
 
 TASKS = ("football", "vis_navi")
 """Scenes with two and with seven bodies that move freely, the robot included."""
@@ -41,13 +41,19 @@ def gradient_figures(rounds: int) -> Iterator[BenchFigure]:
     env.close()
 
 
-def _figures(task: str, worlds: int, rounds: int) -> Iterator[BenchFigure]:
+def standing_step(task: str, worlds: int) -> tuple[ArenaEnv, EngineStep, EngineState, torch.Tensor]:
+    """Worlds whose robots stand after the start-up, their step, its state, and targets that take a gradient."""
     env = ArenaEnv(task, tracker=trackers.get("twist2"), worlds=worlds, engine="mujoco", fast_physics=True)
     env.reset(list(range(worlds)))
     for _ in range(env.startup_ticks):
         env.step(torch.tensor(STAND_ACTION).repeat(worlds, 1))
     step = EngineStep(env.physics)
     state, targets = step.state(), torch.from_numpy(env.physics.ctrl.numpy().copy()).double().requires_grad_()
+    return env, step, state, targets
+
+
+def _figures(task: str, worlds: int, rounds: int) -> Iterator[BenchFigure]:
+    env, step, state, targets = standing_step(task, worlds)
     spent: dict[str, list[float]] = {"bare": [], "forward": [], "backward": []}
     for _ in range(rounds + 1):  # the first one warms up
         with as_before(env.physics):
