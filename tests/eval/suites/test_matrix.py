@@ -92,7 +92,7 @@ def test_a_finished_suite_plays_nothing(played, suite, capsys):
     assert (played / "suite.1-of-1.jsonl").read_bytes() == before
 
 
-def start(suite, out, *flags, hangs="expert still", shard="1-of-1", begins="begun"):
+def start(suite, out, *flags, hangs="expert stand", shard="1-of-1", begins="begun"):
     """The command line in a process of its own whose policies hang, once the suite's journal holds a text."""
     process = Child("eval_fakes", ["matrix", str(suite), "--out", str(out), *flags], FAKE_HANGS=hangs)
     path = out / f"suite.{shard}.jsonl"
@@ -104,7 +104,7 @@ def start(suite, out, *flags, hangs="expert still", shard="1-of-1", begins="begu
 def test_kill_and_again_gives_the_same_episodes(suite, played, tmp_path):
     """`kill -9` within a cell, with a torn last line, then the same command: every cell equals the undisturbed one."""
     out = tmp_path / "killed"
-    process = start(suite, out, hangs="still", begins='"cell":"still/twist2/boxing/base","event":"begun"')
+    process = start(suite, out, hangs="stand", begins='"cell":"still/twist2/boxing/base","event":"begun"')
     process.send_signal(signal.SIGKILL)
     process.communicate()
     with (out / "suite.1-of-1.jsonl").open("ab") as file:
