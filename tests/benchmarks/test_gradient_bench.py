@@ -58,7 +58,7 @@ def test_what_holds_through_a_kick_is_counted():
 
 
 def test_flights_and_mujocos_differences_are_figures(monkeypatch):
-    """A kick along the grass is a centimetre at most; differences with the engine's solver are near a converged one's."""
+    """A short kick is a centimetre off at most; differences with the engine's solver are near a converged one's."""
     monkeypatch.setattr(gradient_bench, "LONGEST_KICK", 21)
     monkeypatch.setattr(flight_bench, "KICKS", ((2.0, 0.0, 0.0),))
     flight, transition = gradient_bench.slope_figures(GradientBenchOptions(what=("flights", "transition")))
