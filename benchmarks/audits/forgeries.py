@@ -24,7 +24,8 @@ import torch
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.audit.action_replay import drawn, replay
+from arena_newton.eval.audit.action_replay import replay
+from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.run import run as evaluate

@@ -21,13 +21,17 @@ from arena_newton.files.stored_json import JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
+__all__ = ["AUDIT_FILE", "ENGINE", "LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
 
 MAX_DERIVED_BYTES = 512 << 20
 MOST_FAULTS = 1000
 """Contradictions that an audit lists; a forged folder may have many times as many."""
 
 
+AUDIT_FILE = "audit.json"
+"""An audit's findings, by folder."""
+ENGINE = "mujoco"
+"""The engine whose episodes can be played again to the last bit."""
 SELF_REPORTED, CONSISTENT, REPLAYED, RERUN = "self-reported", "consistent", "replayed", "re-run"
 LEVELS = {
     SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
@@ -60,6 +64,14 @@ class Audit:
     """Numbers of the episodes whose actions are not there."""
     replayed: int | None = None
     """Episodes that were played again; None: that was not asked for."""
+    draw: int | None = None
+    """The auditor's number by which they were drawn; None: all were taken."""
+    played: list[int] = field(default_factory=list)
+    """Their numbers in the plan."""
+    policy: str | None = None
+    """Spec of the policy that was asked again."""
+    tolerance: float = 0.0
+    """Largest difference of an action that was still taken for the policy's."""
     asked: int | None = None
     """Episodes at whose queries the policy was asked again."""
     fresh: int | None = None
@@ -97,6 +109,11 @@ class Audit:
             "contradictions": self.faults,
             "notes": self.notes,
             "replayed": self.replayed,
+            "draw": self.draw,
+            "played": self.played,
+            "policy": self.policy,
+            "asked": self.asked,
+            "tolerance": self.tolerance,
             "largest differences": self.largest,
         }
 
@@ -219,7 +236,7 @@ def write_pages(audits: list[Audit], out: Path) -> None:
         StorageError: A file cannot be written.
     """
     content = {str(one.run.folder): one.to_json() for one in audits}
-    write_atomic(out / "audit.json", json.dumps(content, indent=2) + "\n")
+    write_atomic(out / AUDIT_FILE, json.dumps(content, indent=2) + "\n")
     lines = ["# Audit", ""]
     for one in audits:
         lines += [f"## {escaped(str(one.run.folder))}: {one.level}", ""]
