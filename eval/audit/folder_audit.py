@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import html
+import io
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -23,6 +25,11 @@ from arena_newton.pages.tables import Table, escaped
 
 __all__ = ["AUDIT_FILE", "ENGINE", "LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
 
+RESULTS_FILE, TABLE_FILE = "results.json", "table.csv"
+WRITER = "written_by"
+"""Key of results.json that names the code that wrote the derived files."""
+UNCHANGED = "config_hash planned finished complete head".split()
+"""Keys of results.json that all code of a version gives alike."""
 MAX_DERIVED_BYTES = 512 << 20
 MOST_FAULTS = 1000
 """Contradictions that an audit lists; a forged folder may have many times as many."""
@@ -174,34 +181,58 @@ def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit, publishe
 
 
 def _derived_faults(run: RunRecord, found: Audit) -> Iterator[str]:
-    """Derived files that are not what journal and configuration give."""
-    here = is_current(run)
+    """Derived files that are not what journal and configuration give.
+
+    Bytes are held to those that this code writes. Where `results.json` names other code, or none, the figures of
+    `results.json` and `table.csv` are held alone: other code words its pages differently.
+    """
     wanted = report.derived_files(run, found.results)
     wanted |= {f"{ORIGINAL}/{name}": text for name, text in report.original_of(run).items()}
-    missing, names = [], {name for one in run.records for name in (one.task, one.tracker, one.mode, one.outcome)}
+    here = is_current(run)
+    same = here and _same_writer(run.folder / RESULTS_FILE, wanted[RESULTS_FILE])
+    missing, other, names = [], [], {one for r in run.records for one in (r.task, r.tracker, r.mode, r.outcome)}
     for name, text in wanted.items():
         path = run.folder / name
-        again = "is not what journal and configuration give; `eval report` writes it again"
         try:
             data = read_regular(path, MAX_DERIVED_BYTES)
         except FileNotFoundError:
             missing.append(name)
             continue
-        if here and data != text.encode():
-            if name != "report.html" or _shown(data.decode(errors="replace"), names) != _shown(text, names):
-                yield f"{path}: {again}"
-            else:
-                what = "the figures and names in its text were compared, not what its style and script show"
-                found.notes.append(f"{name} was written with another template: {what}.")
-        elif not here and name == "results.json" and not _same_figures(data, found.results):
-            yield f"{path}: its cells or suites are not those of the journal"
+        if data == text.encode():
+            continue
+        if name == RESULTS_FILE and not same:
+            if not _same_figures(data, text, UNCHANGED if here else ()):
+                yield f"{path}: its cells or suites are not those of the journal"
+        elif name == TABLE_FILE and here and not same:
+            if not _same_columns(data, text):
+                yield f"{path}: its figures are not those of the journal"
+        elif not same:
+            other += [name] * here
+        elif name != "report.html" or _shown(data.decode(errors="replace"), names) != _shown(text, names):
+            yield f"{path}: is not what journal and configuration give; `eval report` writes it again"
+        else:
+            what = "the figures and names in its text were compared, not what its style and script show"
+            found.notes.append(f"{name} was written with another template: {what}.")
     extra = {path.relative_to(run.folder).as_posix() for path in (run.folder / ORIGINAL).rglob("*") if path.is_file()}
     for name in sorted(extra - set(wanted)):
         yield f"{run.folder / name}: is of no episode of the journal"
     if missing:
         found.notes.append(f"{counted(len(missing), 'derived file')} not there, such as {missing[0]}.")
+    if other:
+        found.notes.append(f"Written by other code, not compared: {' '.join(other)}.")
     if not here:
         found.notes.append("Written by another version: of the tables the figures alone were compared.")
+
+
+def _same_writer(path: Path, text: str) -> bool:
+    """True if a results.json names the code that writes this text, or cannot be read, which is no excuse."""
+    try:
+        stored = parse(read_regular(path, MAX_DERIVED_BYTES))
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        return True
+    return not isinstance(stored, dict) or stored.get(WRITER) == json.loads(text)[WRITER]
 
 
 def _shown(page: str, names: set[str]) -> list[str]:
@@ -210,23 +241,31 @@ def _shown(page: str, names: set[str]) -> list[str]:
     return [word for word in html.unescape(visible).split() if word in names or any(map(str.isdigit, word))]
 
 
-def _same_figures(data: bytes, results: Results) -> bool:
-    """True if a results.json of any version has these cells and suites."""
+def _same_figures(data: bytes, text: str, keys: Sequence[str]) -> bool:
+    """True if a results.json of any code has the cells and suites of this text, and the same values of some keys."""
+    ours: JsonObject = json.loads(text)
     try:
         stored = parse(data)
     except ValueError:
         return False
-    ours: JsonObject = json.loads(json.dumps({"cells": results["cells"], "suites": results["suites"]}))
-    if not isinstance(stored, dict):
+    if not isinstance(stored, dict) or any(stored[key] != ours[key] for key in keys if key in stored and key in ours):
         return False
-    for kind, rows in ours.items():
-        given = stored.get(kind)
+    for kind in ("cells", "suites"):
+        given, rows = stored.get(kind), ours[kind]
         if not isinstance(given, list) or len(given) != len(rows):
             return False
         for one, row in zip(given, rows, strict=True):
             if not isinstance(one, dict) or any(one[key] != row[key] for key in one if key in row):
                 return False
     return True
+
+
+def _same_columns(data: bytes, text: str) -> bool:
+    """True if a table.csv of any code has the rows of this text, as far as both have a column."""
+    given, rows = (list(csv.DictReader(io.StringIO(one))) for one in (data.decode(errors="replace"), text))
+    return len(given) == len(rows) and all(
+        one[key] == row[key] for one, row in zip(given, rows, strict=True) for key in one if key in row
+    )
 
 
 def write_pages(audits: list[Audit], out: Path) -> None:

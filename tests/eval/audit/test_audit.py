@@ -161,6 +161,24 @@ def test_a_page_of_another_template_is_no_edited_page(folder, capsys):
         assert code == 1 and len(found) == 1 and "report.html: is not what journal and configuration give" in found[0]
 
 
+def test_pages_of_other_code_are_no_edited_pages(folder, capsys):
+    """Reports that other code of this version worded are named, not accused, as long as the tables have the figures."""
+    content = json.loads((folder / "results.json").read_text())
+    content.pop("written_by")
+    content["more"] = 1
+    (folder / "results.json").write_text(json.dumps(content))
+    with (folder / "report.md").open("a") as page:
+        page.write("A sentence of other code.\n")
+    code, found = audit(folder, capsys)
+    assert code == 0, found
+    assert main(["audit", str(folder)]) == 0
+    assert "Written by other code, not compared: report.md." in capsys.readouterr().out
+    (folder / "results.json").write_text(json.dumps(content | {"cells": []}))
+    assert audit(folder, capsys)[1][0].endswith("results.json: its cells or suites are not those of the journal")
+    (folder / "results.json").write_text("{")  # no code can be read: no excuse
+    assert len(audit(folder, capsys)[1]) == 2
+
+
 class Other(FakePolicy):
     """A policy that decides otherwise; recordings are played as they are."""
 
