@@ -40,5 +40,5 @@ def found_probability(forged: float, episodes: int) -> float:
 
 
 def odds(episodes: int) -> str:
-    """How probably so many drawn episodes show one, in words."""
+    """Probabilities that so many drawn episodes show one, in words."""
     return ", ".join(f"{found_probability(f, episodes):.0%} if {f:.0%} are forged" for f in FORGED)

@@ -136,7 +136,10 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         InputError: It holds no run, or journal or configuration cannot be read as one.
     """
     document = read_document(folder)
-    records, _ = read_journal(folder / JOURNAL_FILE)
+    path = folder / JOURNAL_FILE
+    records, whole = read_journal(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
     seeds, known = document["config"]["seeds"], document["gym_ids"]
     planned = [record for record in records if record.task in known and record.group_seed in seeds]
     run = RunRecord(folder, document, in_plan_order(planned))
@@ -158,6 +161,8 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         found.notes.append(f"{counted(unshown, 'episode')} without a hash of what the policy was shown: not compared.")
     if retried := len({one.index for one in records if one.outcome == "error"} & _ended(records)):
         found.notes.append(f"{counted(retried, 'episode')} ended as an error first, and was played again.")
+    if (left := path.stat().st_size - whole) > 0:
+        found.notes.append(f"The last {left:,} bytes of {JOURNAL_FILE} are no whole line: they were not read.")
     if not found.results["complete"]:
         found.notes.append(f"Incomplete: {found.results['finished']} of {found.results['planned']} episodes.")
     return found
@@ -262,7 +267,10 @@ def _same_figures(data: bytes, text: str, keys: Sequence[str]) -> bool:
 
 def _same_columns(data: bytes, text: str) -> bool:
     """True if a table.csv of any code has the rows of this text, as far as both have a column."""
-    given, rows = (list(csv.DictReader(io.StringIO(one))) for one in (data.decode(errors="replace"), text))
+    try:
+        given, rows = (list(csv.DictReader(io.StringIO(one))) for one in (data.decode(errors="replace"), text))
+    except csv.Error:
+        return False
     return len(given) == len(rows) and all(
         one[key] == row[key] for one, row in zip(given, rows, strict=True) for key in one if key in row
     )

@@ -75,7 +75,10 @@ def check_entry(
     at_hand = bool(entry.bundle) and (entry.own or (folder / BUNDLE_FILE).exists())
     if at_hand:
         checked.faults += filter(None, [unpack(folder / BUNDLE_FILE, entry.bundle, into)])
-        cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
+        try:
+            cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
+        except InputError as error:
+            raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
         checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
         weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
         if cells and entry.checkpoint != weights:
@@ -113,7 +116,7 @@ def _hold_level(checked: CheckedEntry, folder: Path, *, at_hand: bool) -> None:
 
 
 def _covered(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
-    """What the audit next to an entry covers, in words."""
+    """Sentences about the audit next to an entry."""
     used = [stated[audit.head] for audit in audits]
     again, finished = sum(len(one.played) for one in used), sum(audit.results["finished"] for audit in audits)
     draws = " ".join(sorted({str(one.draw) for one in used if one.draw is not None}))

@@ -81,7 +81,7 @@ def read_entry(folder: Path) -> BoardEntry:
         content: dict[str, Json] = tomllib.loads(read_regular(path, MAX_CONFIG_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of text, TOML, a number of 5,000 digits, and arrays within arrays
         raise InputError(f"{path}: not readable as TOML ({plain_text(error, 200)})") from None
     known = [one.name for one in dataclasses.fields(BoardEntry)]
     for key in content:
@@ -100,5 +100,6 @@ def entry_text(known: Mapping[str, object], before: BoardEntry | None = None) ->
     """Text of an entry's file: known keys, and those that its author fills in, empty or as they were before."""
     left = ("numbers", "rows") if before is None or before.own else ()
     written = [one.name for one in dataclasses.fields(BoardEntry) if one.name not in left]
-    values = {name: "" if before is None else getattr(before, name) for name in written} | known
+    values: dict[str, object] = {name: "" if before is None else getattr(before, name) for name in written}
+    values |= known
     return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())

@@ -28,7 +28,7 @@ Number = Annotated[int, Fit("a number from 0 on", lambda v: v >= 0)]
 
 @dataclass(frozen=True)
 class AuditStatement:
-    """What `audit.json` says of one run."""
+    """Findings of an audit of one run, as `audit.json` has them."""
 
     head: Name
     contradictions: tuple[str, ...]
@@ -45,7 +45,7 @@ class AuditStatement:
 
 
 def read_statements(folder: Path) -> dict[str, AuditStatement]:
-    """What the `audit.json` next to an entry says of each run, by its head; nothing where there is none.
+    """Findings in the `audit.json` next to an entry, by the head of their run; none where there is no such file.
 
     Raises:
         InputError: It is damaged; the message names file and key.
@@ -81,7 +81,7 @@ def earned_level(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) 
 
 
 def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
-    """What an audit that played the bundle's episodes again would not have left out; empty: nothing."""
+    """First thing that an audit that played the bundle's episodes again would have; empty: nothing is missing."""
     if not stated:
         return f"there is no {AUDIT_FILE}"
     number = playable = 0
@@ -108,7 +108,7 @@ def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement])
 
 
 def _not_asked(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
-    """What an audit that asked the policy again would not have left out; empty: nothing."""
+    """First thing that an audit that asked the policy again would have; empty: nothing is missing."""
     for one in (stated[audit.head] for audit in audits):
         if one.policy is None or one.asked != len(one.played):
             return f"{AUDIT_FILE}: asked is {shown(one.asked)} of {counted(len(one.played), 'episode')} played again"

@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def made_bundle(
     if stream.tell() > MAX_BUNDLE_BYTES or size > MAX_UNPACKED_BYTES or len(names) > MAX_FILES:
         raise InputError(f"{folder}: its bundle has {stream.tell():,} bytes, expected at most {MAX_BUNDLE_BYTES:,}")
     cells = [cell for audit in audits for cell in cells_of(audit.run)]
-    known = {
+    known: dict[str, object] = {
         "simulator": "arena_newton",
         "trackers": sorted({cell.tracker for cell in cells}),
         "level": earned_level(audits, stated)[0],
@@ -96,7 +97,10 @@ def made_bundle(
 def _by_columns(path: Path, data: bytes) -> bytes:
     """Arrays of an NPZ file unpacked and in columns, which the archive packs a tenth smaller; their hash stays."""
     stream = io.BytesIO()
-    np.savez(stream, **{name: np.asarray(array, order="F") for name, array in read_arrays(path, content=data).items()})
+    columns: dict[str, Any] = {
+        name: np.asarray(array, order="F") for name, array in read_arrays(path, content=data).items()
+    }
+    np.savez(stream, **columns)
     return stream.getvalue()
 
 

@@ -174,8 +174,10 @@ def test_an_entry_without_a_key_or_file_is_refused(entry, capsys):
         path.write_text(re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE))
         code, said, _ = build(entry, capsys)
         assert code == 2 and f"{path}: {key} is missing" in said, said
-    path.write_text("name = ")
-    assert build(entry, capsys)[0] == 2
+    for damaged in ("name = ", f"rows = [1{'0' * 5000}]", f"rows = {'[' * 3000}{']' * 3000}"):
+        path.write_text(damaged)
+        code, said, _ = build(entry, capsys)
+        assert code == 2 and f"{path}: not readable as TOML" in said, said
     path.write_text(text)
     (entry / "bundle.zip").unlink()
     assert "bundle.zip: no such file" in build(entry, capsys)[1]
@@ -320,6 +322,14 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         assert not list(entry.parent.parent.rglob("escaped.*"))
 
 
+def test_what_is_damaged_in_a_bundle_is_named_by_it(entry, capsys):
+    """A message about a file of a bundle names the bundle, not the folder into which it was unpacked."""
+    for name, said in (("config.json", "no results folder"), ("episodes.jsonl", "/episodes.jsonl: no such file")):
+        copied = shutil.copytree(entry, entry.parent / name)
+        repacked(copied, lambda members, name=name: members.pop(name))
+        assert f"error: {copied / 'bundle.zip'}" in (found := build(copied, capsys)[1]) and said in found
+
+
 def test_a_bundle_is_deflated_and_has_a_plain_name(entry, capsys):
     """A bundle packed by another method than deflate, and an entry whose page would leave the site, are refused."""
     repacked(entry, lambda members: members.update({"config.json": b" " * 50_000_000}), zipfile.ZIP_BZIP2)
@@ -351,9 +361,10 @@ def test_text_of_an_entry_stays_text(entry, capsys):
 
 
 def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
-    """The entries in leaderboard/ pass schema and audit, and the board names each."""
+    """The entries in leaderboard/ pass schema, audit and the replay of a short episode, and the board names each."""
     monkeypatch.chdir(ROOT)
-    assert main(["leaderboard", "build", "--out", str(tmp_path / "site")]) == 0, capsys.readouterr().out
+    flags = ["--replay", "1", "--draw", "10", "--out", str(tmp_path / "site")]
+    assert main(["leaderboard", "build", *flags]) == 0, capsys.readouterr().out
     text = (tmp_path / "site" / "index.html").read_text()
     entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
     assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)
