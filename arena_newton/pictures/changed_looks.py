@@ -91,7 +91,7 @@ class Changes:
     exposure: float = 0.8
     """Gain, gamma, cast, a smooth field, noise."""
     key_objects: float = 0.15
-    """Of shapes that a hand must find (`TaskSpec.recolour` between 0 and 1), in a sample with new colours."""
+    """New colours of shapes that a hand must find (`TaskSpec.recolour` between 0 and 1)."""
 
 
 USUAL = Changes()
