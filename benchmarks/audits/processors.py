@@ -13,7 +13,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import warp
+
 from arena_newton.errors import InputError
+from arena_newton.eval.audit.action_replay import replay
+from arena_newton.eval.audit.draws import drawn
+from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure
 from benchmarks.bench_options import ProcessorOptions
 
@@ -66,14 +71,8 @@ def processor_figures(options: ProcessorOptions) -> Iterator[BenchFigure]:
 
 def _replayed_here(folder: str, policy: str) -> str:
     """Findings of a replay in this process, as JSON, and the processor time of a second one, when all is loaded."""
-    import warp
-
     if (flags := os.environ.get(WARP)) is not None:
         warp.config.cpu_compiler_flags = flags
-    from arena_newton.eval.audit.action_replay import replay
-    from arena_newton.eval.audit.draws import drawn
-    from arena_newton.eval.audit.folder_audit import audited
-
     for _ in range(2):
         audit = audited(Path(folder).expanduser())
         began = time.process_time()

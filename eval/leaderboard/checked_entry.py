@@ -80,8 +80,9 @@ def check_entry(
             cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
         except InputError as error:
             raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
-        untrained = {"setting": IN_GMT} if entry.training_data == "none" else {}  # many tasks are no merged training
-        checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell), **untrained) for cell in cells]
+        checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
+        if entry.training_data == "none":  # a policy of many tasks without a merged training
+            checked.rates = [replace(rate, setting=IN_GMT) for rate in checked.rates]
         weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
         if cells and entry.checkpoint != weights:
             checked.faults.append(f"{where}: checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}")
