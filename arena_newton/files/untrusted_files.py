@@ -10,7 +10,7 @@ import stat
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -150,14 +150,16 @@ def read_arrays(
                     arrays[name] = np.empty(0)
                     continue
                 with archive.open(member) as file:
-                    total += _size(file, member, f"{where}: not a readable NPZ file: array {name}")
-                if total > allowed:
-                    raise InputError(
-                        f"{where}: array {name} would make its arrays {total / limits.MIB:.0f} MiB, expected at most "
-                        f"{allowed / limits.MIB:.0f}"
-                    )
-                with archive.open(member) as file:
-                    arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+                    shape, by_columns, dtype = _header(file, member, f"{where}: not a readable NPZ file: array {name}")
+                    needed = math.prod(shape) * dtype.itemsize
+                    total += max(needed, math.prod(shape))
+                    if total > allowed:
+                        raise InputError(
+                            f"{where}: array {name} would make its arrays {total / limits.MIB:.0f} MiB, expected at "
+                            f"most {allowed / limits.MIB:.0f}"
+                        )
+                    order: Literal["F", "C"] = "F" if by_columns else "C"
+                    arrays[name] = np.ndarray(shape, dtype, bytearray(file.read(needed)), order=order)
     except InputError:
         raise
     except FileNotFoundError as error:
@@ -167,22 +169,21 @@ def read_arrays(
     return arrays
 
 
-def _size(file: IO[bytes], member: zipfile.ZipInfo, where: str) -> int:
-    """Bytes of the array whose header comes next.
+def _header(file: IO[bytes], member: zipfile.ZipInfo, where: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, order and type of the array whose header comes next; true: column after column.
 
     Raises:
-        InputError: The header promises another number of bytes than the member has.
+        InputError: The header promises more bytes than the member has, or objects.
     """
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"version {version}")
-    shape, _, dtype = _HEADERS[version](file, max_header_size=limits.HEADER_BYTES)
+    shape, by_columns, dtype = _HEADERS[version](file, max_header_size=limits.HEADER_BYTES)
     if dtype.hasobject:
         raise InputError(f"{where} holds objects, expected numbers or text")
-    size = math.prod(shape) * max(dtype.itemsize, 1)
-    if min(shape, default=0) < 0 or size > member.file_size:
+    if min(shape, default=0) < 0 or math.prod(shape) * max(dtype.itemsize, 1) > member.file_size:
         raise InputError(f"{where} has shape {list(shape)} of {dtype}, but {member.file_size} bytes")
-    return size
+    return shape, by_columns, dtype
 
 
 def numbers(array: np.ndarray, where: str, dtype: Any) -> np.ndarray:

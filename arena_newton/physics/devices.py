@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import itertools
 import os
 import re
+import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +23,10 @@ NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
 DRIVERS = ("libcuda.so", "libcuda.so.1")
 """Names by which Warp loads NVIDIA's driver; without it there is no GPU, and Warp need not be asked."""
+LIST_GPUS = ("nvidia-smi", "--list-gpus")
+"""Program of the driver that lists them, a line for each."""
+LIST_TIMEOUT = 60.0
+"""Time after which its answer is no longer waited for [s]."""
 
 
 def resolve_engine(engine: str, device: str | None) -> tuple[str, str]:
@@ -108,8 +114,20 @@ def cluster_engine(engine: str, device: str | None, gpus: float | None) -> tuple
 
 
 def visible_gpus() -> list[str]:
-    """GPUs of this machine that this process may use, as `CUDA_VISIBLE_DEVICES` names them; Warp is not loaded."""
+    """GPUs of this machine that this process may use, as `CUDA_VISIBLE_DEVICES` names them; Warp is not loaded.
+
+    A virtual machine or container may lack the driver's folder: its programs, and then torch, are asked there.
+    """
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is not None:
         return list(itertools.takewhile(lambda name: name not in ("", "-1"), map(str.strip, named.split(","))))
-    return [str(number) for number, _ in enumerate(NVIDIA_DEVICES.iterdir())] if NVIDIA_DEVICES.is_dir() else []
+    count = sum(1 for _ in NVIDIA_DEVICES.iterdir()) if NVIDIA_DEVICES.is_dir() else 0
+    if not count and any(map(_loads, DRIVERS)):
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            listed = subprocess.run(LIST_GPUS, capture_output=True, text=True, check=True, timeout=LIST_TIMEOUT)
+            count = sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
+        if not count:
+            import torch
+
+            count = torch.cuda.device_count()
+    return list(map(str, range(count)))

@@ -90,6 +90,8 @@ class Changes:
     rectangles: float = 0.1
     exposure: float = 0.8
     """Gain, gamma, cast, a smooth field, noise."""
+    key_objects: float = 0.15
+    """New colours of shapes that a hand must find (`TaskSpec.recolour` between 0 and 1)."""
 
 
 USUAL = Changes()
@@ -154,12 +156,13 @@ def changed_looks(
     batch, height, width = seen.shape[:3]
     device = seen.device
     shapes = frames[..., 0].reshape(batch, -1).long()
-    chance = chances.gather(1, shapes)
+    own = chances.gather(1, shapes)
+    chance = own + ((own > 0.0) & (own < 1.0)) * (changes.key_objects - own)
     luma = luminance(seen).reshape(batch, -1)
     pixels = seen.reshape(batch, -1, 3).float() / 255.0
     owner = objects.gather(1, shapes)
     pixels = recoloured(pixels, luma, shapes, owner, chance, (height, width), changes)
-    free = chance >= 1.0
+    free = own >= 1.0
     pixels = _with_things(pixels, luma, owner, chance, free, task, (height, width), changes.things)
     inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
     pixels = torch.where(inside[..., None], _colours((batch, 1), device), pixels)

@@ -6,7 +6,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from arena_newton.eval.audit.action_replay import FORGED, drawn, found_probability, replay
+from arena_newton.eval.audit.action_replay import replay
+from arena_newton.eval.audit.draws import drawn, odds
 from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure, cores
 from benchmarks.bench_options import AuditTimeOptions
@@ -37,5 +38,5 @@ def audit_times(options: AuditTimeOptions) -> Iterator[BenchFigure]:
         note = f"{len(chosen)} took {elapsed:.0f} s, {used:.0f} s of processor time; {len(audit.faults)} contradictions"
         yield BenchFigure("60 episodes played again on two cores", REPLAY, "s", True, 60 * elapsed / len(chosen), note)
     for number in (5, 10, 29, 59):
-        odds = ", ".join(f"{found_probability(one, number):.0%} if {one:.0%} are forged" for one in FORGED)
-        yield BenchFigure(f"{number} episodes played again", None, "", False, None, f"find a forged line with {odds}")
+        sure = f"find a forged line with {odds(number)}"
+        yield BenchFigure(f"{number} episodes played again", None, "", False, None, sure)

@@ -12,7 +12,8 @@ import torch
 
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
-from arena_newton.eval.audit.action_replay import DRIFT, MEASURED, drawn, replay
+from arena_newton.eval.audit.action_replay import DRIFT, MEASURED, replay
+from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.audit import AuditOptions

@@ -24,7 +24,8 @@ import torch
 from arena_newton import trackers
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.eval.audit.action_replay import drawn, replay
+from arena_newton.eval.audit.action_replay import replay
+from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.run import run as evaluate
@@ -256,6 +257,22 @@ def cells(text: str) -> str:
     return json.dumps(content, indent=2) + "\n"
 
 
+def by_other_code(change: Callable[[str], str]) -> Callable[[str], str]:
+    """A change of results.json, which names no code then: its figures alone are compared."""
+    return lambda text: json.dumps(dict(list(json.loads(change(text)).items())[:-1]))
+
+
+def other_head(text: str) -> str:
+    """results.json with another head."""
+    return json.dumps(json.loads(text) | {"head": "0" * 64})
+
+
+def rates_by_other_code(folder: Path, lines: list[Line]) -> None:
+    """table.csv with another rate, in a folder whose results.json names no code."""
+    for name, change in (("results.json", by_other_code(str)), ("table.csv", rates)):
+        in_table(name, change)(folder, lines)
+
+
 def rates(text: str) -> str:
     """table.csv with another rate."""
     rows = list(csv.reader(io.StringIO(text)))
@@ -268,6 +285,9 @@ TABLES: dict[str, Forgery] = {
     "table.csv": in_table("table.csv", rates),
     "table.md": in_table("table.md", lambda text: text.replace("| ", "| 1", 5)),
     "report.md": in_table("report.md", lambda text: text.replace("success", "failure", 1) + "\n"),
+    "results.json, by other code": in_table("results.json", by_other_code(cells)),
+    "head in results.json, by other code": in_table("results.json", by_other_code(other_head)),
+    "table.csv, by other code": rates_by_other_code,
     "report.html": in_table("report.html", lambda text: text.replace("%</", "9 %</", 1)),
 }
 """Forgeries of derived files, by name."""

@@ -222,7 +222,8 @@ def accusations(count: int, replayed: int, seed: int = 0) -> Iterator[tuple[str,
     Raises:
         InputError: A run was refused.
     """
-    from arena_newton.eval.audit.action_replay import drawn, replay
+    from arena_newton.eval.audit.action_replay import replay
+    from arena_newton.eval.audit.draws import drawn
     from arena_newton.eval.audit.folder_audit import audited
 
     worlds = Worlds()

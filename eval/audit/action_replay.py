@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,8 @@ from arena_newton.eval.audit.claimed_conditions import (
     hold_signals,
     note_difference,
 )
-from arena_newton.eval.audit.folder_audit import Audit
+from arena_newton.eval.audit.draws import odds
+from arena_newton.eval.audit.folder_audit import ENGINE, Audit
 from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
@@ -43,13 +43,12 @@ from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
 from arena_newton.trackers.base import Tracker
 
-__all__ = ["ENGINE", "drawn", "found_probability", "replay", "played", "rollout_flags", "stored_cameras", "through"]
+__all__ = ["ENGINE", "played", "replay", "rollout_flags", "stored_cameras", "through"]
 
 COMPARED = "outcome reason steps margin startup_fall overflow predicates progress events".split()
 """Keys of a line that a replay must give again, numbers to the last bit."""
 EVIDENCE = ("final_state", "shown")
 """Hashes of a line that it must give again, where the line has them."""
-ENGINE = "mujoco"
 DECIDED = ("outcome", "reason")
 """Keys of a line that episodes of another engine must give when each tick is checked from its recorded state."""
 DRIFT = 4.0
@@ -58,31 +57,8 @@ UNITS = {"positions": "m", "velocities": "m/s or rad/s"}
 MEASURED = ("position", "velocity", "position over a second", "velocity over a second")
 LATE = 2
 """Ticks by which such an episode may end earlier or later: a force or margin near its bar."""
-FORGED = (0.01, 0.05, 0.1, 0.25)
-"""Fractions of forged lines for which an audit says how probably the drawn episodes find one."""
 MOST_SAMPLES = 4
 """Most rays per pixel along each axis of a stored camera that is drawn again."""
-
-
-def drawn(audit: Audit, count: int | None, seed: int) -> list[EpisodeRecord]:
-    """Episodes to play again, drawn by the head of the journal and a number of the auditor's own.
-
-    Args:
-        audit: Of the folder; episodes without actions, and those that ended as errors, cannot be drawn.
-        count: Number of them; None: all.
-        seed: The auditor's number. Whoever forged the folder must not know it before the head is published.
-    """
-    lacking = set(audit.lacking)
-    candidates = [r for r in audit.run.records if r.index not in lacking and r.steps and r.outcome != "error"]
-    if count is None or count >= len(candidates):
-        return candidates
-    chosen = random.Random(f"{audit.head} {seed}").sample(range(len(candidates)), count)
-    return [candidates[number] for number in sorted(chosen)]
-
-
-def found_probability(forged: float, episodes: int) -> float:
-    """Probability that one of so many drawn episodes is of a fraction of forged lines."""
-    return 1.0 - (1.0 - forged) ** episodes
 
 
 def rollout_flags(stored: RunOptions, policy: str, *kinds: type) -> RunOptions:
@@ -130,11 +106,11 @@ def replay(
     if records:
         tolerances = tick_tolerance, velocity_tolerance
         _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tolerances=tolerances)
-    audit.replayed = len(records)
+    audit.replayed, audit.played = len(records), [record.index for record in records]
+    audit.policy, audit.tolerance = policy, tolerance
     audit.largest |= {"answer": totals.largest} if policy is not None else {}
     audit.largest |= dict(zip(MEASURED, totals.furthest, strict=True)) if by_tick else {}
-    odds = ", ".join(f"{found_probability(f, len(records)):.0%} if {f:.0%} are forged" for f in FORGED)
-    sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds}"
+    sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds(len(records))}"
     audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
     if by_tick:
         audit.notes.append(

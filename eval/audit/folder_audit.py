@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import html
+import io
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -21,13 +23,22 @@ from arena_newton.files.stored_json import JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
+__all__ = ["AUDIT_FILE", "ENGINE", "LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
 
+RESULTS_FILE, TABLE_FILE = "results.json", "table.csv"
+WRITER = "written_by"
+"""Key of results.json that names the code that wrote the derived files."""
+UNCHANGED = "config_hash planned finished complete head".split()
+"""Keys of results.json that all code of a version gives alike."""
 MAX_DERIVED_BYTES = 512 << 20
 MOST_FAULTS = 1000
 """Contradictions that an audit lists; a forged folder may have many times as many."""
 
 
+AUDIT_FILE = "audit.json"
+"""An audit's findings, by folder."""
+ENGINE = "mujoco"
+"""The engine whose episodes can be played again to the last bit."""
 SELF_REPORTED, CONSISTENT, REPLAYED, RERUN = "self-reported", "consistent", "replayed", "re-run"
 LEVELS = {
     SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
@@ -60,6 +71,14 @@ class Audit:
     """Numbers of the episodes whose actions are not there."""
     replayed: int | None = None
     """Episodes that were played again; None: that was not asked for."""
+    draw: int | None = None
+    """The auditor's number by which they were drawn; None: all were taken."""
+    played: list[int] = field(default_factory=list)
+    """Their numbers in the plan."""
+    policy: str | None = None
+    """Spec of the policy that was asked again."""
+    tolerance: float = 0.0
+    """Largest difference of an action that was still taken for the policy's."""
     asked: int | None = None
     """Episodes at whose queries the policy was asked again."""
     fresh: int | None = None
@@ -97,6 +116,11 @@ class Audit:
             "contradictions": self.faults,
             "notes": self.notes,
             "replayed": self.replayed,
+            "draw": self.draw,
+            "played": self.played,
+            "policy": self.policy,
+            "asked": self.asked,
+            "tolerance": self.tolerance,
             "largest differences": self.largest,
         }
 
@@ -112,7 +136,10 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         InputError: It holds no run, or journal or configuration cannot be read as one.
     """
     document = read_document(folder)
-    records, _ = read_journal(folder / JOURNAL_FILE)
+    path = folder / JOURNAL_FILE
+    records, whole = read_journal(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
     seeds, known = document["config"]["seeds"], document["gym_ids"]
     planned = [record for record in records if record.task in known and record.group_seed in seeds]
     run = RunRecord(folder, document, in_plan_order(planned))
@@ -134,6 +161,8 @@ def audited(folder: Path, published: str | None = None) -> Audit:
         found.notes.append(f"{counted(unshown, 'episode')} without a hash of what the policy was shown: not compared.")
     if retried := len({one.index for one in records if one.outcome == "error"} & _ended(records)):
         found.notes.append(f"{counted(retried, 'episode')} ended as an error first, and was played again.")
+    if (left := path.stat().st_size - whole) > 0:
+        found.notes.append(f"The last {left:,} bytes of {JOURNAL_FILE} are no whole line: they were not read.")
     if not found.results["complete"]:
         found.notes.append(f"Incomplete: {found.results['finished']} of {found.results['planned']} episodes.")
     return found
@@ -157,34 +186,58 @@ def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit, publishe
 
 
 def _derived_faults(run: RunRecord, found: Audit) -> Iterator[str]:
-    """Derived files that are not what journal and configuration give."""
-    here = is_current(run)
+    """Derived files that are not what journal and configuration give.
+
+    Bytes are held to those that this code writes. Where `results.json` names other code, or none, the figures of
+    `results.json` and `table.csv` are held alone: other code words its pages differently.
+    """
     wanted = report.derived_files(run, found.results)
     wanted |= {f"{ORIGINAL}/{name}": text for name, text in report.original_of(run).items()}
-    missing, names = [], {name for one in run.records for name in (one.task, one.tracker, one.mode, one.outcome)}
+    here = is_current(run)
+    same = here and _same_writer(run.folder / RESULTS_FILE, wanted[RESULTS_FILE])
+    missing, other, names = [], [], {one for r in run.records for one in (r.task, r.tracker, r.mode, r.outcome)}
     for name, text in wanted.items():
         path = run.folder / name
-        again = "is not what journal and configuration give; `eval report` writes it again"
         try:
             data = read_regular(path, MAX_DERIVED_BYTES)
         except FileNotFoundError:
             missing.append(name)
             continue
-        if here and data != text.encode():
-            if name != "report.html" or _shown(data.decode(errors="replace"), names) != _shown(text, names):
-                yield f"{path}: {again}"
-            else:
-                what = "the figures and names in its text were compared, not what its style and script show"
-                found.notes.append(f"{name} was written with another template: {what}.")
-        elif not here and name == "results.json" and not _same_figures(data, found.results):
-            yield f"{path}: its cells or suites are not those of the journal"
+        if data == text.encode():
+            continue
+        if name == RESULTS_FILE and not same:
+            if not _same_figures(data, text, UNCHANGED if here else ()):
+                yield f"{path}: its cells or suites are not those of the journal"
+        elif name == TABLE_FILE and here and not same:
+            if not _same_columns(data, text):
+                yield f"{path}: its figures are not those of the journal"
+        elif not same:
+            other += [name] * here
+        elif name != "report.html" or _shown(data.decode(errors="replace"), names) != _shown(text, names):
+            yield f"{path}: is not what journal and configuration give; `eval report` writes it again"
+        else:
+            what = "the figures and names in its text were compared, not what its style and script show"
+            found.notes.append(f"{name} was written with another template: {what}.")
     extra = {path.relative_to(run.folder).as_posix() for path in (run.folder / ORIGINAL).rglob("*") if path.is_file()}
     for name in sorted(extra - set(wanted)):
         yield f"{run.folder / name}: is of no episode of the journal"
     if missing:
         found.notes.append(f"{counted(len(missing), 'derived file')} not there, such as {missing[0]}.")
+    if other:
+        found.notes.append(f"Written by other code, not compared: {' '.join(other)}.")
     if not here:
         found.notes.append("Written by another version: of the tables the figures alone were compared.")
+
+
+def _same_writer(path: Path, text: str) -> bool:
+    """True if a results.json names the code that writes this text, or cannot be read, which is no excuse."""
+    try:
+        stored = parse(read_regular(path, MAX_DERIVED_BYTES))
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        return True
+    return not isinstance(stored, dict) or stored.get(WRITER) == json.loads(text)[WRITER]
 
 
 def _shown(page: str, names: set[str]) -> list[str]:
@@ -193,23 +246,34 @@ def _shown(page: str, names: set[str]) -> list[str]:
     return [word for word in html.unescape(visible).split() if word in names or any(map(str.isdigit, word))]
 
 
-def _same_figures(data: bytes, results: Results) -> bool:
-    """True if a results.json of any version has these cells and suites."""
+def _same_figures(data: bytes, text: str, keys: Sequence[str]) -> bool:
+    """True if a results.json of any code has the cells and suites of this text, and the same values of some keys."""
+    ours: JsonObject = json.loads(text)
     try:
         stored = parse(data)
     except ValueError:
         return False
-    ours: JsonObject = json.loads(json.dumps({"cells": results["cells"], "suites": results["suites"]}))
-    if not isinstance(stored, dict):
+    if not isinstance(stored, dict) or any(stored[key] != ours[key] for key in keys if key in stored and key in ours):
         return False
-    for kind, rows in ours.items():
-        given = stored.get(kind)
+    for kind in ("cells", "suites"):
+        given, rows = stored.get(kind), ours[kind]
         if not isinstance(given, list) or len(given) != len(rows):
             return False
         for one, row in zip(given, rows, strict=True):
             if not isinstance(one, dict) or any(one[key] != row[key] for key in one if key in row):
                 return False
     return True
+
+
+def _same_columns(data: bytes, text: str) -> bool:
+    """True if a table.csv of any code has the rows of this text, as far as both have a column."""
+    try:
+        given, rows = (list(csv.DictReader(io.StringIO(one))) for one in (data.decode(errors="replace"), text))
+    except csv.Error:
+        return False
+    return len(given) == len(rows) and all(
+        one[key] == row[key] for one, row in zip(given, rows, strict=True) for key in one if key in row
+    )
 
 
 def write_pages(audits: list[Audit], out: Path) -> None:
@@ -219,7 +283,7 @@ def write_pages(audits: list[Audit], out: Path) -> None:
         StorageError: A file cannot be written.
     """
     content = {str(one.run.folder): one.to_json() for one in audits}
-    write_atomic(out / "audit.json", json.dumps(content, indent=2) + "\n")
+    write_atomic(out / AUDIT_FILE, json.dumps(content, indent=2) + "\n")
     lines = ["# Audit", ""]
     for one in audits:
         lines += [f"## {escaped(str(one.run.folder))}: {one.level}", ""]

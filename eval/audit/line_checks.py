@@ -56,10 +56,17 @@ def configuration_faults(run: RunRecord) -> Iterator[str]:
     for name in FLAGS:
         if name in options and (options[name] or None) != ((named := config.get(name)) or None):
             yield f"{path}: config: {name} is {shown(named)}, its options have {shown(options[name])}"
+    if "policy" in options and _scheme(options["policy"]) != _scheme(config["policy"]):
+        yield f"{path}: config: policy is {shown(config['policy'])}, its options have {shown(options['policy'])}"
     if "variant" in options and (options["variant"] is None) != (config.get("variant") is None):
         yield f"{path}: config: variant is {shown(config.get('variant'))}, its options have {shown(options['variant'])}"
     if run.status is not None and run.status["state"] == "success" and not is_complete(run):
         yield f"{path}: status is success, but {len(run.records)} episodes do not complete the plan"
+
+
+def _scheme(policy: object) -> str:
+    """Kind of a policy, such as `lerobot`; the path after it is shortened in an identity."""
+    return str(policy).partition(":")[0]
 
 
 def line_faults(run: RunRecord, records: Sequence[EpisodeRecord]) -> Iterator[str]:

@@ -58,6 +58,7 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
     Raises:
         InputError: A folder holds no run, or cannot be read as one.
     """
+    from arena_newton.eval.audit.draws import drawn
     from arena_newton.eval.audit.folder_audit import audited, print_findings, runs_in, write_pages
     from arena_newton.eval.records.chain import joint_head
     from arena_newton.files.text import counted
@@ -82,10 +83,11 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
     for folder in named:
         one = audited(folder, options.head)
         if options.replay or options.all:
-            from arena_newton.eval.audit.action_replay import drawn, replay
+            from arena_newton.eval.audit.action_replay import replay
 
             names = ("policy", "tolerance", "tick_tolerance", "velocity_tolerance")
             asked = {name: getattr(options, name) for name in names}
+            one.draw = None if options.all else draw
             chosen = drawn(one, None if options.all else options.replay, draw)
             replay(one, chosen, factories, **asked)
         if options.fresh and options.policy is not None:

@@ -89,8 +89,9 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
 class BundleOptions:
     """Make an entry of the leaderboard from a run: its journal, some actions and strips as bundle.zip, and entry.toml.
 
-    entry.toml has empty keys that its author fills in; `eval leaderboard build` names them
-    (docs/howto/evaluate/leaderboard.md).
+    entry.toml has empty keys that its author fills in; `eval leaderboard build` names them. An entry of the same runs
+    keeps those that are filled in. With the audit.json of `eval audit --out` in the entry's folder the actions of the
+    episodes that were played again come along, and the level is what that proves (docs/howto/evaluate/leaderboard.md).
     """
 
     out: str = "leaderboard/mine"
@@ -110,22 +111,25 @@ def bundle(folders: Sequence[Path], options: BundleOptions) -> int:
         StorageError: A file cannot be written.
     """
     from arena_newton.cli.flags import check_least, user_path
-    from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE
+    from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, entry_text, read_entry
+    from arena_newton.eval.leaderboard.evidence import read_statements
     from arena_newton.eval.leaderboard.result_bundle import made_bundle
     from arena_newton.eval.records.journal import StorageError, write_atomic
     from arena_newton.files.own_files import replace_atomically
 
     check_least(options, 0, "actions", "strips")
     (folder,), out = folders, user_path(options.out)
-    if (out / ENTRY_FILE).exists():
-        raise InputError(f"--out {out}: holds an entry already")
-    data, text = made_bundle(folder, options.actions, options.strips)
+    before = read_entry(out) if (out / ENTRY_FILE).exists() else None
+    data, known = made_bundle(folder, options.actions, options.strips, read_statements(out))
+    if before is not None and before.head != known["head"]:
+        raise InputError(f"--out {out}: holds an entry of other runs already")
     try:
         with replace_atomically(out / BUNDLE_FILE) as file:
             file.write(data)
     except OSError as error:
         raise StorageError(f"{out / BUNDLE_FILE}: cannot be written ({error.strerror})") from None
-    write_atomic(out / ENTRY_FILE, text)
+    write_atomic(out / ENTRY_FILE, entry_text(known, before))
     print(f"bundle: {out / BUNDLE_FILE}, {len(data):,} bytes")
-    print(f"entry: {out / ENTRY_FILE}; fill in its empty keys, then: python -m arena_newton.eval leaderboard build")
+    print(f"entry: {out / ENTRY_FILE}, level {known['level']}; fill in its empty keys")
+    print("then: python -m arena_newton.eval leaderboard build")
     return 0

@@ -69,7 +69,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     checkpoint = read_act_checkpoint(folder)
     facts = checkpoint.facts
     before = read_card(folder) if (folder / CARD_FILE).is_file() else None  # of one that is packed again
-    digests = (checkpoint.digest, packed_digest(folder))
+    digests = (checkpoint.digest, packed_digest(folder), *filter(None, [before.trained_weights if before else ""]))
     found = _results([Path(name).expanduser() for name in options.results], digests)
     kept = _kept(before, digests, found)
     found = (*found, *kept)
@@ -96,6 +96,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
         tasks=tuple(dict.fromkeys(chosen)),
         command=options.command or training_command(facts) or (before.command if before is not None else ""),
         looks=changed_looks(facts) or (before.looks if before is not None else ()),
+        trained_weights=before.trained_weights if before is not None else "",
         packed_by="; then ".join([*([before.packed_by] if before and kept else []), packed_by]),
         note=options.note or (before.note if before is not None else ""),
         results=_in_order(found, chosen, facts.trackers),
@@ -135,8 +136,10 @@ def _trainings(folders: Sequence[Path], facts: CheckpointFacts, digests: Sequenc
     """
     from arena_newton.policies.learned.learned_card import OtherTraining
 
-    ours = {"family": facts.family, "recipe": facts.recipe, "datasets": [dict(one) for one in facts.datasets]}
+    datasets = [dict(one) for one in facts.datasets]
+    ours = {"family": facts.family, "recipe": facts.recipe, "datasets": _names_of(datasets)}
     seeds: dict[str, int] = {}
+    again: set[str] = set()
     found: dict[str, list[EvaluatedCell]] = {}
     for folder in folders:  # one by one: cells of two trainings have the same names
         runs, cells, _ = _usual(
@@ -144,16 +147,29 @@ def _trainings(folders: Sequence[Path], facts: CheckpointFacts, digests: Sequenc
         )
         for run in runs:
             stated = run.config.get("policy_facts") or {}
+            theirs = stated.get("datasets", datasets)
             for name, value in ours.items():
-                if name in stated and stated[name] != value:
+                if (_names_of(theirs) if name == "datasets" else stated.get(name, value)) != value:
                     raise InputError(f"--trainings {folder}: is of another {name} than this checkpoint")
-            seeds[str(stated.get("weights"))] = int(stated.get("seed") or 0)
+            weights = str(stated.get("weights"))
+            seeds[weights] = int(stated.get("seed") or 0)
+            again |= {weights} if theirs != datasets else set()
         for cell in cells:
             found.setdefault(cell.weights, []).append(cell)
     return tuple(
-        OtherTraining(seed=seeds.get(weights, 0), weights=weights, results=_counts("--trainings", cells))
+        OtherTraining(
+            seed=seeds.get(weights, 0),
+            weights=weights,
+            results=_counts("--trainings", cells),
+            recorded_again=weights in again,
+        )
         for weights, cells in found.items()
     )
+
+
+def _names_of(datasets: object) -> list[object]:
+    """Names of datasets as a checkpoint's facts have them."""
+    return [one.get("name") for one in datasets if isinstance(one, dict)] if isinstance(datasets, list) else []
 
 
 def _usual(

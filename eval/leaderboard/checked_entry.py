@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
-from arena_newton.eval.audit.folder_audit import Audit, audited, runs_in
+from arena_newton.eval.audit.draws import drawn, odds
+from arena_newton.eval.audit.folder_audit import AUDIT_FILE, CONSISTENT, LEVELS, SELF_REPORTED, Audit, audited, runs_in
 from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, BoardEntry, read_entry
+from arena_newton.eval.leaderboard.evidence import AuditStatement, earned_level, read_statements
 from arena_newton.eval.leaderboard.result_bundle import unpack
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS, PROTOCOL_SEEDS
 from arena_newton.eval.records.chain import joint_head
@@ -65,14 +67,18 @@ def check_entry(
         factories: What worlds and trackers are made with; the real ones by default.
 
     Raises:
-        InputError: Its file is unfit, or numbers or bundle are missing or cannot be read.
+        InputError: Its file is unfit, numbers or bundle are missing or cannot be read, or it claims a higher level
+            than its evidence gives.
     """
     checked = CheckedEntry(folder.name, read_entry(folder))
     entry, where = checked.entry, f"{checked.name}/{ENTRY_FILE}"
     at_hand = bool(entry.bundle) and (entry.own or (folder / BUNDLE_FILE).exists())
     if at_hand:
         checked.faults += filter(None, [unpack(folder / BUNDLE_FILE, entry.bundle, into)])
-        cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
+        try:
+            cells = [] if checked.faults else _audit(checked, into, replays, draw, factories)
+        except InputError as error:
+            raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
         checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
         weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
         if cells and entry.checkpoint != weights:
@@ -89,7 +95,36 @@ def check_entry(
     played = sorted({one for rate in checked.rates for one in rate.tracker.split("+")})
     if played != sorted(entry.trackers):
         checked.faults.append(f"{where}: trackers are {' '.join(entry.trackers)}, its numbers have {' '.join(played)}")
+    if not checked.faults:
+        _hold_level(checked, folder, at_hand=at_hand)
     return checked
+
+
+def _hold_level(checked: CheckedEntry, folder: Path, *, at_hand: bool) -> None:
+    """Hold the level that an entry claims to what it carries, and say what its audit covers.
+
+    Raises:
+        InputError: It claims more.
+    """
+    stated, order = read_statements(folder), list(LEVELS)
+    earned, missing = earned_level(checked.audits, stated) if at_hand else (SELF_REPORTED, f"no {BUNDLE_FILE} is there")
+    level = checked.entry.level
+    if order.index(level) > order.index(earned):
+        raise InputError(f"{folder / ENTRY_FILE}: level is {level}, its evidence gives {earned}: {missing}")
+    if order.index(earned) > order.index(CONSISTENT):
+        checked.notes.append(_covered(checked.audits, stated))
+
+
+def _covered(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
+    """Sentences about the audit next to an entry."""
+    used = [stated[audit.head] for audit in audits]
+    again, finished = sum(len(one.played) for one in used), sum(audit.results["finished"] for audit in audits)
+    draws = " ".join(sorted({str(one.draw) for one in used if one.draw is not None}))
+    text = f"{AUDIT_FILE}: {again} of {counted(finished, 'episode')} played again"
+    text += f", by draw {draws}; their actions are in the bundle" if draws else ""
+    sure = "any forged line" if again == finished else f"a forged line with {odds(again)}"
+    policies = " ".join(sorted({one.policy for one in used if one.policy is not None}))
+    return f"{text}. That finds {sure}." + f" Policy {policies} was asked again at their queries." * bool(policies)
 
 
 def _audit(
@@ -100,7 +135,7 @@ def _audit(
     for folder in folders:
         audit = audited(folder)
         if replays:
-            from arena_newton.eval.audit.action_replay import drawn, replay  # loads the simulator
+            from arena_newton.eval.audit.action_replay import replay  # loads the simulator
 
             replay(audit, drawn(audit, replays, draw), factories)
         checked.audits.append(audit)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +17,7 @@ from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, loaded, read_regular
 from arena_newton.files.text import is_printable, plain_text
 
-__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "BoardEntry", "read_entry"]
+__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "BoardEntry", "entry_text", "read_entry"]
 
 ENTRY_FILE = "entry.toml"
 BUNDLE_FILE = "bundle.zip"
@@ -47,7 +49,7 @@ class BoardEntry:
     hardware: Name
     """Machine of the evaluation."""
     level: Level
-    """Level to which a maintainer checked it."""
+    """Level to which it was checked; a build refuses one that is higher than its evidence gives."""
     numbers: Name = "bundle"
     """Source of its numbers: `bundle`, `paper`, `published`, or the path of a `cells.csv` next to the entry's file."""
     rows: tuple[Name, ...] = ()
@@ -59,7 +61,7 @@ class BoardEntry:
     head: Text = ""
     """Head of its journals (docs/howto/evaluate/auditing.md)."""
     checked: Text = ""
-    """Command and day of the check, by the maintainer who raised the level."""
+    """Command and day of the audit, by the maintainer who drew its episodes."""
 
     @property
     def own(self) -> bool:
@@ -79,7 +81,7 @@ def read_entry(folder: Path) -> BoardEntry:
         content: dict[str, Json] = tomllib.loads(read_regular(path, MAX_CONFIG_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of text, TOML, a number of 5,000 digits, and arrays within arrays
         raise InputError(f"{path}: not readable as TOML ({plain_text(error, 200)})") from None
     known = [one.name for one in dataclasses.fields(BoardEntry)]
     for key in content:
@@ -92,3 +94,12 @@ def read_entry(folder: Path) -> BoardEntry:
         if wanted and not getattr(entry, key):
             raise InputError(f"{path}: {key} is empty; level {entry.level} with numbers from {entry.numbers} needs it")
     return entry
+
+
+def entry_text(known: Mapping[str, object], before: BoardEntry | None = None) -> str:
+    """Text of an entry's file: known keys, and those that its author fills in, empty or as they were before."""
+    left = ("numbers", "rows") if before is None or before.own else ()
+    written = [one.name for one in dataclasses.fields(BoardEntry) if one.name not in left]
+    values: dict[str, object] = {name: "" if before is None else getattr(before, name) for name in written}
+    values |= known
+    return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import io
-import json
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from arena_newton.errors import InputError
-from arena_newton.eval.audit.folder_audit import CONSISTENT, audited, runs_in
+from arena_newton.eval.audit.draws import drawn
+from arena_newton.eval.audit.folder_audit import audited, runs_in
 from arena_newton.eval.folders.results import RunRecord
-from arena_newton.eval.leaderboard.entry_file import BoardEntry
+from arena_newton.eval.leaderboard.evidence import AuditStatement, earned_level
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
-from arena_newton.eval.records.journal import JOURNAL_FILE
+from arena_newton.eval.records.journal import BY_CONTENT, JOURNAL_FILE
 from arena_newton.eval.reports.wording import media_of
 from arena_newton.eval.tables.episode_table import cells_of
 from arena_newton.files.stored_json import read_regular
-from arena_newton.files.untrusted_files import create, zip_members
+from arena_newton.files.untrusted_files import create, read_arrays, zip_members
 
 __all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strips_of", "unpack"]
 
@@ -36,35 +38,42 @@ _MEMBER = re.compile(
 """Paths that a bundle may hold: all of them inside the folder into which it is unpacked."""
 
 
-def made_bundle(folder: Path, actions: int, strips: int) -> tuple[bytes, str]:
-    """Archive of the runs in a folder, the same bytes for the same files, and the `entry.toml` that names it.
+def made_bundle(
+    folder: Path, actions: int, strips: int, stated: Mapping[str, AuditStatement]
+) -> tuple[bytes, dict[str, object]]:
+    """Archive of the runs in a folder, the same bytes for the same files, and what `entry.toml` says of it.
 
     Args:
         folder: A results folder, a suite, or a folder of several.
         actions: Episodes of each run whose actions come along; the head of the journal draws them, not the owner.
         strips: Film strips of each run that come along, at most one of a task and outcome, failures first.
+        stated: What an audit says of the runs, by head: the actions of the episodes that it played come along instead.
 
     Returns:
-        The archive, and the text of the entry's file, in which the keys are empty that the author fills in.
+        The archive, and the keys of the entry's file that follow from it.
 
     Raises:
         InputError: There is no run, an audit finds a contradiction, or the bundle would be too large.
     """
-    from arena_newton.eval.audit.action_replay import drawn  # loads the simulator, which a build does not need
-
     names = [path for pattern in (SUITE_FILE, "suite.*.jsonl") for path in sorted(folder.glob(pattern))]
-    audits = [audited(inside) for inside in runs_in(folder)]
+    audits, columns = [audited(inside) for inside in runs_in(folder)], set[Path]()
     for audit in audits:
         if audit.faults:
             raise InputError(f"{audit.faults[0]}; all contradictions: eval audit {folder}")
         inside = audit.run.folder
         names += [inside / CONFIG_FILE, inside / JOURNAL_FILE]
-        names += [inside / str((one.media or {})["actions"]) for one in drawn(audit, actions, 0)] if actions else []
+        chosen = drawn(audit, actions, 0) if actions else []
+        if (one := stated.get(audit.head)) is not None and one.played:
+            chosen = [record for record in audit.run.records if record.index in set(one.played) - set(audit.lacking)]
+        paths = {inside / str((record.media or {})["actions"]): record.schema for record in chosen}
+        columns |= {path for path, schema in paths.items() if schema >= BY_CONTENT}
+        names += paths
         names += [path for _, path in strips_of(audit.run)][:strips]
     stream, size = io.BytesIO(), 0
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for path in names:
             name, data = path.relative_to(folder).as_posix(), read_regular(path, MAX_UNPACKED_BYTES)
+            data = _by_columns(path, data) if path in columns else data
             size += len(data)
             if not _MEMBER.fullmatch(name):
                 raise InputError(f"{path}: a bundle holds plain names of letters, digits and _ . + = - alone")
@@ -74,17 +83,25 @@ def made_bundle(folder: Path, actions: int, strips: int) -> tuple[bytes, str]:
     if stream.tell() > MAX_BUNDLE_BYTES or size > MAX_UNPACKED_BYTES or len(names) > MAX_FILES:
         raise InputError(f"{folder}: its bundle has {stream.tell():,} bytes, expected at most {MAX_BUNDLE_BYTES:,}")
     cells = [cell for audit in audits for cell in cells_of(audit.run)]
-    known = {
+    known: dict[str, object] = {
         "simulator": "arena_newton",
         "trackers": sorted({cell.tracker for cell in cells}),
-        "level": CONSISTENT,
+        "level": earned_level(audits, stated)[0],
         "checkpoint": " ".join(sorted({cell.weights for cell in cells} - {""})),
         "bundle": hashlib.sha256(stream.getvalue()).hexdigest(),
         "head": joint_head([audit.results.get("head") for audit in audits]) or "",
     }
-    left = {one.name: "" for one in dataclasses.fields(BoardEntry) if one.name not in ("numbers", "rows")}
-    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in (left | known).items()]
-    return stream.getvalue(), "".join(lines)
+    return stream.getvalue(), known
+
+
+def _by_columns(path: Path, data: bytes) -> bytes:
+    """Arrays of an NPZ file unpacked and in columns, which the archive packs a tenth smaller; their hash stays."""
+    stream = io.BytesIO()
+    columns: dict[str, Any] = {
+        name: np.asarray(array, order="F") for name, array in read_arrays(path, content=data).items()
+    }
+    np.savez(stream, **columns)
+    return stream.getvalue()
 
 
 def strips_of(run: RunRecord) -> Iterator[tuple[str, Path]]:

@@ -19,7 +19,7 @@ from arena_newton.cli.flags import words
 from arena_newton.data.datasets.data_options import BuildOptions
 from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow, policy_name, suite_text
 from arena_newton.eval.loop.stage_state import played, succeeded, trained
-from arena_newton.eval.records.document import CONFIG_FILE
+from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
 
@@ -55,6 +55,11 @@ class PlanFolders:
         """The suite of a row; its file is beside it."""
         return self.out / "evaluation" / row.name
 
+    def suites(self, row: PlanRow) -> list[Path]:
+        """The suite of a row where it was begun, and those of other machines that were put beside it as `<row>@…`."""
+        found = [self.suite(row), *sorted(self.out.glob(f"evaluation/{row.name}@*"))]
+        return [suite for suite in found if (suite / SUITE_FILE).is_file()]
+
     def trained(self, row: PlanRow) -> list[int]:
         """Seeds of the trainings of a row that are whole."""
         found = sorted(int(path.name.rpartition("_")[2]) for path in self.out.glob(f"trainings/{row.name}_[0-9]*"))
@@ -82,6 +87,8 @@ class PlanCommand:
     done: Callable[[], bool] = lambda: False
     after: tuple[str, ...] = ()
     """Commands that must be done before."""
+    needs_all: bool = True
+    """False: one of them is enough, once the others have ended."""
     gpus: int = 0
     """GPUs that it takes."""
     size: float = 0.0
@@ -101,7 +108,7 @@ def plan_commands(
     device: str | None,
     gpus: int,
     minutes: Callable[[], float],
-    middle: Callable[[PlanRow], int],
+    middle: Callable[[Sequence[Path]], tuple[int, list[Path]]],
 ) -> list[PlanCommand]:
     """All commands of a plan, each after those that it needs.
 
@@ -113,7 +120,7 @@ def plan_commands(
         device: Device of all commands; None: the best there is.
         gpus: GPUs of this machine.
         minutes: Time of a training that begins now [min].
-        middle: Seed of the training of a row that is packed.
+        middle: Seed of the training that is packed of those in some suites, and the suites that hold others.
     """
     found: list[PlanCommand] = []
     trackers = plan.record.tracker or ("twist2",)
@@ -141,18 +148,18 @@ def plan_commands(
             PlanCommand(
                 stage="evaluate",
                 name=row.name,
-                words=partial(_evaluated, plan, folders, row, seeds, device, gpus),
-                done=partial(played, folders.suite(row), {policy_name(row, seed) for seed in seeds}),
+                words=partial(_evaluated, plan, folders, row, device, gpus),
+                done=partial(_played, folders, row, seeds),
                 after=tuple(f"train {folders.training(row, seed).name}" for seed in seeds),
+                needs_all=False,
                 gpus=ALL_GPUS,
             )
         )
-    tables = [EVAL, "tables", *(str(folders.suite(row)) for row in rows), "--out", str(folders.tables)]
     found.append(
         PlanCommand(
             stage="tables",
             name="",
-            words=partial(list, [*tables, "--format", "md", "tex", "csv"]),
+            words=partial(_tables, folders, rows),
             after=tuple(f"evaluate {row.name}" for row in rows),
         )
     )
@@ -231,12 +238,9 @@ def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: in
     return ["torch.distributed.run", "--standalone", "--nproc-per-node", str(each), "-m", *command]
 
 
-def _evaluated(
-    plan: LoopPlan, folders: PlanFolders, row: PlanRow, seeds: Sequence[int], device: str | None, gpus: int
-) -> list[str]:
-    """Play the trainings of a row: those of this call, and others that are there."""
-    seeds = sorted({*seeds, *folders.trained(row)})
-    suite = folders.suite(row)
+def _evaluated(plan: LoopPlan, folders: PlanFolders, row: PlanRow, device: str | None, gpus: int) -> list[str]:
+    """Play all trainings of a row that are whole, those of earlier calls too."""
+    suite, seeds = folders.suite(row), folders.trained(row)
     file = suite.with_suffix(".toml")
     file.parent.mkdir(exist_ok=True)
     write_atomic(file, suite_text(plan, row, {seed: folders.training(row, seed) for seed in seeds}))
@@ -244,10 +248,26 @@ def _evaluated(
     return [EVAL, "matrix", str(file), "--out", str(suite), *jobs, *(["--device", device] if device else [])]
 
 
-def _packed(plan: LoopPlan, folders: PlanFolders, row: PlanRow, middle: Callable[[PlanRow], int]) -> list[str]:
+def _played(folders: PlanFolders, row: PlanRow, seeds: Sequence[int]) -> bool:
+    """True if these trainings of a row were played, here or elsewhere."""
+    return played(folders.suites(row), {policy_name(row, seed) for seed in seeds})
+
+
+def _tables(folders: PlanFolders, rows: Sequence[PlanRow]) -> list[str]:
+    suites = [str(suite) for row in rows for suite in folders.suites(row)]
+    return [EVAL, "tables", *suites, "--out", str(folders.tables), "--format", "md", "tex", "csv"]
+
+
+def _packed(
+    plan: LoopPlan,
+    folders: PlanFolders,
+    row: PlanRow,
+    middle: Callable[[Sequence[Path]], tuple[int, list[Path]]],
+) -> list[str]:
     """Pack a training; cells whose budgets were cut are no results, and are not in its card."""
-    suite = str(folders.suite(row))
-    results = [] if plan.evaluate.get("max_steps") else ["--results", suite]
-    others = ["--trainings", suite] if results and len(folders.trained(row)) > 1 else []
-    packed = ["pack", str(folders.training(row, middle(row))), "--out", str(folders.packed)]
-    return [EVAL, *packed, "--tasks", *plan.attempts, *results, *others]
+    suites = folders.suites(row)
+    seed, others = middle(suites)
+    words = [EVAL, "pack", str(folders.training(row, seed)), "--out", str(folders.packed), "--tasks", *plan.attempts]
+    for flag, some in () if plan.evaluate.get("max_steps") else (("--results", suites), ("--trainings", others)):
+        words += [flag, *map(str, some)] if some else []
+    return words

@@ -55,6 +55,8 @@ class PlanSettings:
     """Datasets that are built at once."""
     cells: int = 1
     """Processes that play cells, for each GPU."""
+    again: int = 0
+    """Times that a command is begun again that failed, as a killed one goes on where it was."""
     failures_too: bool = False
     """Train on attempts that did not succeed, too."""
 
@@ -136,7 +138,7 @@ def read_plan(given: str) -> LoopPlan:
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected numbers 1 to 9999")
     if len(set(settings.seeds)) < len(settings.seeds):
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected each once")
-    least = {"minutes": 0.0, "reserve": 0.0, "gpus": 1, "recordings": 1, "datasets": 1, "cells": 1}
+    least = {"minutes": 0.0, "reserve": 0.0, "gpus": 1, "recordings": 1, "datasets": 1, "cells": 1, "again": 0}
     for key, low in least.items():
         if not low <= getattr(settings, key):
             raise InputError(f"{path}: [plan]: {key} is {getattr(settings, key)}, expected at least {low:g}")

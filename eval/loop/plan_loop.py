@@ -78,9 +78,9 @@ def run(options: LoopOptions) -> int:
             device=options.device,
             gpus=len(gpus),
             minutes=lambda: training_minutes(plan, options.minutes, out, len(rows) * len(seeds), len(gpus)),
-            middle=lambda row: plan_report.middle_seed(folders.suite(row)),
+            middle=plan_report.middle_training,
         )
-        player = CommandPlayer(out, gpus, _at_once(plan, len(gpus)), held)
+        player = CommandPlayer(out, gpus, _at_once(plan, len(gpus)), held, plan.settings.again)
         return _play(player, _chosen(commands, options.only), plan, folders, options)
 
 
@@ -90,7 +90,7 @@ def training_minutes(plan: LoopPlan, given: float | None, out: Path, trainings: 
     Args:
         plan: The plan.
         given: Time of all stages [min].
-        out: Folder in which demonstrations were recorded and datasets built.
+        out: Folder in which demonstrations were recorded and datasets built, and trainings perhaps failed.
         trainings: Number of trainings.
         gpus: GPUs of this machine, on which some of them run at once.
 
@@ -99,7 +99,9 @@ def training_minutes(plan: LoopPlan, given: float | None, out: Path, trainings: 
     """
     if given is None:
         return plan.settings.minutes
-    spent = stage_seconds(one for one in command_times(out) if one.stage in ("record", "build")).get("all", 0.0) / 60.0
+    times = command_times(out)
+    before = [one for one in times if one.stage in ("record", "build") or (one.stage == "train" and one.code)]
+    spent = stage_seconds(before).get("all", 0.0) / 60.0
     waves = math.ceil(trainings / _trainings_at_once(plan, gpus))
     left = (given - plan.settings.reserve - spent) / waves
     if left < LEAST_MINUTES:

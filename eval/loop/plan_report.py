@@ -13,13 +13,12 @@ from arena_newton.eval.folders.failure_counts import failure_cells
 from arena_newton.eval.loop.plan_commands import PlanFolders
 from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow
 from arena_newton.eval.loop.plan_run import CommandTime, stage_seconds
-from arena_newton.eval.records.document import SUITE_FILE
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports.progress import duration
 from arena_newton.eval.tables.episode_table import PlayedCell, read_folder
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["PAGE", "middle_seed", "write"]
+__all__ = ["PAGE", "middle_training", "write"]
 
 PAGE = "plan.md"
 """File of the page."""
@@ -59,21 +58,22 @@ def _scores(cells: Sequence[PlayedCell]) -> _Scores:
     return _Scores({seed: won[seed] for seed in sorted(played) if played[seed] == whole}, whole)
 
 
-def _cells(suite: Path) -> list[PlayedCell]:
-    return read_folder(suite, [])[1] if (suite / SUITE_FILE).is_file() else []
+def _cells(suites: Sequence[Path]) -> list[PlayedCell]:
+    return [cell for suite in suites for cell in read_folder(suite, [])[1]]
 
 
-def middle_seed(suite: Path) -> int:
-    """Seed of the training whose sum of successes over all cells is the middle one.
+def middle_training(suites: Sequence[Path]) -> tuple[int, list[Path]]:
+    """Seed of the training whose sum of successes over all cells is the middle one, and suites that hold others.
 
     Raises:
         InputError: No cell was played.
     """
-    cells = _cells(suite)
+    cells = _cells(suites)
     if not cells:
-        raise InputError(f"{suite}: no cell is whole")
+        raise InputError(f"{' '.join(map(str, suites)) or 'evaluation'}: no cell is whole")
     scores = _scores(cells)
-    return next(seed for seed, won in scores.won.items() if won == scores.middle)
+    middle = next(seed for seed, won in scores.won.items() if won == scores.middle)
+    return middle, [suite for suite in suites if any(_seed(cell) != middle for cell in _cells([suite]))]
 
 
 def _condition(cell: PlayedCell) -> str:
@@ -95,7 +95,7 @@ def write(plan: LoopPlan, folders: PlanFolders, times: Sequence[CommandTime], co
     text = [f"# The plan {escaped(plan.name)}", "", f"`{command.replace('`', '')}`", ""]
     text += ["## Time", "", *Table(["stage", "seconds", "commands"], stages, "lr").compact()]
     for row in plan.rows:
-        if cells := _cells(folders.suite(row)):
+        if cells := _cells(folders.suites(row)):
             more, said = _row(plan, row, cells)
             text, lines = text + more, lines + said
     path = folders.out / PAGE

@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,8 @@ __all__ = ["COMMANDS_FILE", "CommandPlayer", "CommandTime", "command_times", "st
 
 COMMANDS_FILE = "commands.jsonl"
 """Lines of the commands that ended."""
+BAD_INPUT = 2
+"""Exit code of a command that would fail again."""
 POLL = 0.1
 """Processes are looked at so often [s]."""
 PATIENCE = 60.0
@@ -91,8 +94,11 @@ class CommandPlayer:
     """Stage → commands of it at once; others one."""
     held: int
     """Open file that keeps the folder: commands that outlive this process keep it until they have ended."""
+    again: int = 0
+    """Times that a command is begun again that failed; bad input fails at once."""
     failed: dict[str, str] = field(default_factory=dict)
     """Commands that failed, and why."""
+    _begun: Counter[str] = field(default_factory=Counter)
     _running: list[_Running] = field(default_factory=list)
 
     def play(self, commands: Sequence[PlanCommand]) -> bool:
@@ -110,16 +116,24 @@ class CommandPlayer:
             left = sum(command in waiting for command in mine)
             if mine:
                 print(f"{stage}: {f'{left} of {len(mine)} to do' if left else 'finished before'}", flush=True)
+
+        def ready(command: PlanCommand) -> bool:
+            ended = done if command.needs_all else done | (self.failed.keys() - set(map(str, waiting)))
+            return ended.issuperset(command.after) and (command.needs_all or not done.isdisjoint(command.after))
+
         try:
             while waiting or self._running:
-                ready = [one for one in waiting if done.issuperset(one.after)]
-                for command in sorted(ready, key=lambda one: -one.size):
+                for command in sorted(filter(ready, waiting), key=lambda one: -one.size):
                     if self._has_room(command):
                         waiting.remove(command)
                         self._begin(command)
                 time.sleep(POLL)
-                done |= {str(one.command) for one in self._ended()}
-                if not self._running and not any(done.issuperset(one.after) for one in waiting):
+                for one in self._ended():
+                    if self._ended_well(one):
+                        done.add(str(one.command))
+                    elif one.process.returncode != BAD_INPUT and self._begun[str(one.command)] <= self.again:
+                        waiting.append(one.command)
+                if not self._running and not any(map(ready, waiting)):
                     break  # what is left needs a command that failed
         finally:
             for one in self._running:
@@ -155,6 +169,8 @@ class CommandPlayer:
                 tied=True,
             )
         self._running.append(_Running(command, process, gpus, time.time()))
+        self._begun[str(command)] += 1
+        self.failed.pop(str(command), None)
         on = f" on GPU {','.join(gpus)}" if gpus else ""
         print(f"[{command}] begun{on}", flush=True)
 
@@ -162,21 +178,22 @@ class CommandPlayer:
         return self.out / "logs" / f"{str(command).replace(' ', '_')}.log"
 
     def _ended(self) -> list[_Running]:
-        """Commands that have ended well since the last call; those that failed are noted."""
-        well = []
-        for one in [one for one in self._running if one.process.poll() is not None]:
-            self._running.remove(one)
-            seconds = self._note(one)
-            code = one.process.returncode
-            if code == 0 or (code == 1 and one.command.done()):  # 1: episodes that ended as errors count
-                well.append(one)
-                print(f"[{one.command}] {seconds:.1f} s", flush=True)
-                continue
-            log = self._log(one.command)
-            last = plain_text("".join(log.read_bytes()[-2000:].decode(errors="replace").splitlines()[-1:]), 300)
-            self.failed[str(one.command)] = f"{how_it_ended(one.process, 0.0)}: {last} ({log})"
-            print(f"[{one.command}] failed: {self.failed[str(one.command)]}", flush=True)
-        return well
+        """Commands that have ended since the last call."""
+        ended = [one for one in self._running if one.process.poll() is not None]
+        self._running = [one for one in self._running if one not in ended]
+        return ended
+
+    def _ended_well(self, one: _Running) -> bool:
+        """Note and say how a command ended; False if it failed."""
+        seconds, code = self._note(one), one.process.returncode
+        if code == 0 or (code == 1 and one.command.done()):  # 1: episodes that ended as errors count
+            print(f"[{one.command}] {seconds:.1f} s", flush=True)
+            return True
+        log = self._log(one.command)
+        last = plain_text("".join(log.read_bytes()[-2000:].decode(errors="replace").splitlines()[-1:]), 300)
+        self.failed[str(one.command)] = f"{how_it_ended(one.process, 0.0)}: {last} ({log})"
+        print(f"[{one.command}] failed: {self.failed[str(one.command)]}", flush=True)
+        return False
 
     def _note(self, one: _Running) -> float:
         """Write the line of a command that ended, and return its time [s]."""

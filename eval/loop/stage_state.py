@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from arena_newton.errors import InputError
-from arena_newton.eval.records.document import SUITE_FILE, read_document
+from arena_newton.eval.records.document import read_document
 from arena_newton.eval.suites.suite_records import read_suite
 from arena_newton.policies.train.training_state import TrainingProgress, last_checkpoint
 
@@ -30,12 +31,10 @@ def trained(folder: Path) -> bool:
     return 0 < progress.steps <= progress.step
 
 
-def played(folder: Path, policies: set[str]) -> bool:
-    """True if all cells of a suite are done, and these policies are among them."""
-    if not (folder / SUITE_FILE).is_file():
-        return False
+def played(suites: Sequence[Path], policies: set[str]) -> bool:
+    """True if all cells of some suites are done, and these policies are among them."""
     try:
-        cells = read_suite(folder).cells
+        cells = [cell for suite in suites for cell in read_suite(suite).cells]
     except InputError:  # and the suite with its own
         return False
     return all(cell.status == "done" for cell in cells) and policies <= {cell.policy for cell in cells}

@@ -39,6 +39,7 @@ __all__ = [
     "moving_versions",
     "own_code",
     "package_files",
+    "report_hash",
     "scene_files",
     "scenes_hash",
 ]
@@ -70,6 +71,8 @@ UNHASHED = (
 )
 """Rooms that prepare, report or measure but move and judge no episode of a run, as command lines do
 (`__main__.py`). All other code counts, whatever is added to the package."""
+REPORTERS = ("eval/folders", "eval/records", "eval/reports", "eval/statistics", "pages")
+"""Those of them that write the tables and reports of a run."""
 UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
 UNRULED = (
@@ -182,6 +185,13 @@ def code_hash(root: Path = PACKAGE) -> str:
 def _running_code() -> str:
     """Hash of the code that was loaded: what is edited later does not run in this process."""
     return hash_paths(PACKAGE, code_files(PACKAGE))
+
+
+@functools.cache
+def report_hash() -> str:
+    """Hash of the code that writes tables and reports: that of a run, whose names they show, and `REPORTERS`."""
+    written = [file for room in REPORTERS for file in package_files(PACKAGE / room)]
+    return config_hash([code_hash(), hash_paths(PACKAGE, written)])
 
 
 def scene_files(root: Path, tasks: Collection[str], known: Collection[str], modes: Collection[str] = ()) -> list[Path]:

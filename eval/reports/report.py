@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from arena_newton.eval.folders.original_format import ORIGINAL, original_files, write_original
 from arena_newton.eval.folders.results import Results, RunRecord, changed_conditions, results_json, width_rule
 from arena_newton.eval.plan.rounds import LOOK_EVERY
+from arena_newton.eval.records.identity import report_hash
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.reports import html_report
 from arena_newton.eval.reports.failure_text import failures_markdown
@@ -202,9 +203,9 @@ def write_reports(run: RunRecord) -> Results:
 
 
 def derived_files(run: RunRecord, results: Results) -> dict[str, str]:
-    """Texts of results.json, table.md, table.csv, report.md and report.html, by name."""
+    """Texts of results.json, which names the code that wrote them, table.md, table.csv, report.md and report.html."""
     return {
-        "results.json": json.dumps(results, indent=2) + "\n",
+        "results.json": json.dumps(results | {"written_by": report_hash()}, indent=2) + "\n",
         "table.md": table(results) + (f"\nHead of the journal: {results['head']}\n" if "head" in results else ""),
         "table.csv": table_csv(results),
         "report.md": _markdown(run, results),

@@ -83,6 +83,8 @@ class OtherTraining:
     weights: str
     """First 12 hex digits of the SHA-256 of its weights."""
     results: Results
+    recorded_again: bool = False
+    """Its datasets are those of the same names from other recordings of the same demonstrations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +116,8 @@ class PolicyCard:
     """Command that packed it."""
     weights: str = ""
     """First 12 hex digits of the SHA-256 of the packed weights."""
+    trained_weights: str = ""
+    """The same of the checkpoint's, by which its results are found when the packed policy is packed again."""
     precision: str = "float16"
     """Precision of its matrices; vectors are float32, and it computes in float32."""
     bytes: int = 0
@@ -151,7 +155,10 @@ class PolicyCard:
             "packed by": f"`{self.packed_by}`" if self.packed_by else "",
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",
             "weights": self.weights,
-            "other trainings": ", ".join(f"seed {one.seed} (weights {one.weights})" for one in self.trainings),
+            "other trainings": ", ".join(
+                f"seed {one.seed} (weights {one.weights}{', demonstrations recorded again' * one.recorded_again})"
+                for one in self.trainings
+            ),
         }
         about = Table(("", ""), [(name, _cell(text)) for name, text in rows.items() if text])
         lines = ["# The learned policy", "", *([self.note, ""] if self.note else []), *about.compact()]

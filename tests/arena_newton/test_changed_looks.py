@@ -1,5 +1,7 @@
 """Changed looks: what never changes, and that nothing of semantic mode's scenes is drawn."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -134,6 +136,23 @@ def test_robot_and_things_whose_colour_matters_stay(batch):
         seldom += int(changed[shapes == SELDOM].float().mean() * 1000)
         walls += int(changed[shapes == WALL].float().mean() * 1000)
     assert 0 < seldom < 1500 and 4000 < walls < 9000
+
+
+def test_what_a_hand_must_find_changes_as_often_as_is_asked(batch):
+    """Shapes of a chance between 0 and 1 get another colour never, or as walls do; what keeps its colour keeps it."""
+    seen, frames, *_ = batch
+    shapes = frames[..., 0]
+    for asked in (0.0, 1.0):
+        torch.manual_seed(1)
+        changed = [
+            differ(changed_looks(*batch, replace(STILL, key_objects=asked, things=0.0, rectangles=0.0)), seen)
+            for _ in range(10)
+        ]
+        found, walls = (
+            np.mean([float(one[shapes == kind].float().mean()) for one in changed]) for kind in (SELDOM, WALL)
+        )
+        assert not any(one[shapes <= KEPT].any() for one in changed)
+        assert found == 0.0 if asked == 0.0 else abs(found - walls) < 0.2, (found, walls)
 
 
 def test_texture_and_shading_stay(batch):

@@ -125,6 +125,61 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
     assert capsys.readouterr().err == f"error: {tmp_path}: no results folder (it has no config.json)\n"
 
 
+def with_file(name, content):
+    """Damage: a file of the folder with other bytes; none: it is gone."""
+
+    def damage(folder):
+        path = folder / name
+        path.unlink()
+        if content is not None:
+            path.write_bytes(content)
+
+    return damage
+
+
+def with_options(folder):
+    """Damage: the flags name another kind of policy than the configuration."""
+    content = json.loads((folder / "config.json").read_text())
+    content["options"]["policy"] = "process:touch /tmp/started"
+    (folder / "config.json").write_text(json.dumps(content))
+
+
+def by_other_code(folder):
+    """Damage: a table that no CSV reader takes, of other code."""
+    with_file("results.json", None)(folder)
+    with_file("table.csv", b"task\n" + b"a" * 200_000)(folder)
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "named"),
+    [
+        (with_file("episodes.jsonl", None), 2, "run/episodes.jsonl: no such file"),
+        (with_file("config.json", b""), 2, "run/config.json: cannot be read as the configuration of a run"),
+        (with_file("episodes.jsonl", b"\xff\xfe\n{}\n"), 2, "run/episodes.jsonl: line 1 is not a JSON object"),
+        (with_file("results.json", b'{"cells": NaN}'), 1, "run/results.json: is not what journal and"),
+        (with_file("actions/sonic/boxing_base_s0_r0.npz", b"hello"), 1, "boxing_base_s0_r0.npz: not a readable NPZ"),
+        (by_other_code, 1, "run/table.csv: its figures are not those of the journal"),
+        (with_options, 1, 'run/config.json: config: policy is "expert", its options have "process:touch /tmp/started"'),
+    ],
+    ids="journal config bytes nan actions csv policy".split(),
+)
+def test_a_damaged_folder_is_named(folder, capsys, damage, code, named):
+    """A file that is gone, empty, no text or no archive is one line with its name, and code 2, or 1 where it lies."""
+    damage(folder)
+    assert main(["audit", str(folder)]) == code
+    said = capsys.readouterr()
+    lines = said.err.splitlines() if code == 2 else [one for one in said.out.splitlines() if "contradiction: " in one]
+    assert len(lines) == 1 and named in lines[0], lines
+
+
+def test_bytes_that_are_no_line_are_said(folder, capsys):
+    """What a kill left behind the last whole line of a journal is not read, and an audit says so."""
+    with (folder / "episodes.jsonl").open("ab") as journal:
+        journal.write(b"[1, 2]\n")
+    assert main(["audit", str(folder)]) == 0
+    assert "The last 7 bytes of episodes.jsonl are no whole line: they were not read." in capsys.readouterr().out
+
+
 REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
 REPLAYED |= {"a failure made a success", "every failure made a success", "a success under the seed of a failure"}
 REPLAYED |= {"weights of trackers, with all hashes", "an environment, with its hash"}
@@ -159,6 +214,24 @@ def test_a_page_of_another_template_is_no_edited_page(folder, capsys):
         assert page.read_text() != other, old
         code, found = audit(folder, capsys)
         assert code == 1 and len(found) == 1 and "report.html: is not what journal and configuration give" in found[0]
+
+
+def test_pages_of_other_code_are_no_edited_pages(folder, capsys):
+    """Reports that other code of this version worded are named, not accused, as long as the tables have the figures."""
+    content = json.loads((folder / "results.json").read_text())
+    content.pop("written_by")
+    content["more"] = 1
+    (folder / "results.json").write_text(json.dumps(content))
+    with (folder / "report.md").open("a") as page:
+        page.write("A sentence of other code.\n")
+    code, found = audit(folder, capsys)
+    assert code == 0, found
+    assert main(["audit", str(folder)]) == 0
+    assert "Written by other code, not compared: report.md." in capsys.readouterr().out
+    (folder / "results.json").write_text(json.dumps(content | {"cells": []}))
+    assert audit(folder, capsys)[1][0].endswith("results.json: its cells or suites are not those of the journal")
+    (folder / "results.json").write_text("{")  # no code can be read: no excuse
+    assert len(audit(folder, capsys)[1]) == 2
 
 
 class Other(FakePolicy):

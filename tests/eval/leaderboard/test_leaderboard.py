@@ -16,6 +16,8 @@ from eval_fakes import factories
 from made_signals import signals
 
 from arena_newton.eval.__main__ import main
+from arena_newton.eval.audit import folder_audit
+from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.leaderboard.entry_file import BoardEntry
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -94,7 +96,10 @@ def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
     assert (site / "ours" / "bundle.zip").read_bytes() == (entry / "bundle.zip").read_bytes()
     for page in site.glob("*.html"):
         assert all((site / address).is_file() for address in Page(page).addresses), page
-    assert main(["bundle", str(made.parent / "run"), "--out", str(entry)]) == 2
+    other = shutil.copytree(entry, entry.parent / "other")
+    fill(other, head="0" * 64)
+    assert main(["bundle", str(made.parent / "run"), "--out", str(other)]) == 2
+    assert "holds an entry of other runs already" in capsys.readouterr().err
 
 
 def filmed(run):
@@ -169,8 +174,10 @@ def test_an_entry_without_a_key_or_file_is_refused(entry, capsys):
         path.write_text(re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE))
         code, said, _ = build(entry, capsys)
         assert code == 2 and f"{path}: {key} is missing" in said, said
-    path.write_text("name = ")
-    assert build(entry, capsys)[0] == 2
+    for damaged in ("name = ", f"rows = [1{'0' * 5000}]", f"rows = {'[' * 3000}{']' * 3000}"):
+        path.write_text(damaged)
+        code, said, _ = build(entry, capsys)
+        assert code == 2 and f"{path}: not readable as TOML" in said, said
     path.write_text(text)
     (entry / "bundle.zip").unlink()
     assert "bundle.zip: no such file" in build(entry, capsys)[1]
@@ -231,6 +238,81 @@ def test_an_edited_result_is_found(entry, edit, named, capsys):
     assert code == 1 and named in said and not site.exists(), said
 
 
+@pytest.fixture(scope="module")
+def audited(made):
+    """An entry of the run after an audit that played all its episodes again and asked the policy."""
+    entry = made.parent / "audited" / "ours"
+    asked = ["--all", "--policy", "stand", "--out", str(entry)]
+    assert main(["audit", str(made.parent / "run"), *asked], factories()) == 0
+    for _ in range(2):  # made again, an entry keeps what was filled in
+        assert main(["bundle", str(made.parent / "run"), "--out", str(entry)]) == 0
+        fill(entry, checked="eval audit --all", **KEYS)
+    return entry
+
+
+def stated(entry, **keys):
+    """Change what audit.json says of the run."""
+    path = entry / "audit.json"
+    ((name, content),) = json.loads(path.read_text()).items()
+    path.write_text(json.dumps({name: content | keys}))
+
+
+def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
+    """An audit next to an entry gives the bundle its actions and the entry its level; the page says what it covers."""
+    entry = shutil.copytree(audited, tmp_path / "ours")
+    assert tomllib.loads((entry / "entry.toml").read_text())["level"] == "re-run"
+    code, said, site = build(entry, capsys, "--replay", "16", "--draw", "1")
+    assert code == 0 and "ours: re-run, 4 rates" in said, said
+    covered = "audit.json: 16 of 16 episodes played again. That finds any forged line. Policy stand was asked again"
+    assert covered in (site / "ours.html").read_text()
+    stated(entry, policy=None, asked=None)
+    fill(entry, level="replayed")
+    assert build(entry, capsys)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("forge", "named"),
+    [
+        (lambda entry: (entry / "audit.json").unlink(), "gives consistent: there is no audit.json"),
+        (lambda entry: stated(entry, head="0" * 64), "gives consistent: audit.json: head of no run is "),
+        (lambda entry: stated(entry, contradictions=["steps"]), "gives consistent: audit.json: contradictions: steps"),
+        (lambda entry: stated(entry, played=[]), "gives consistent: audit.json: played is not all episodes"),
+        (lambda entry: stated(entry, played=[0, 0]), "gives consistent: audit.json: played is not all episodes"),
+        (lambda entry: stated(entry, draw=7, played=[0, 1]), "played is not what draw 7 draws by the head"),
+        (lambda entry: few(entry), "gives consistent: audit.json: played is 2 episodes, expected at least 16"),
+        (lambda entry: repacked(entry, actions_left_out), "gives consistent: bundle.zip: actions of episode "),
+        (lambda entry: stated(entry, policy=None), "gives replayed: audit.json: asked is 16 of 16 episodes"),
+        (lambda entry: stated(entry, asked=15), "gives replayed: audit.json: asked is 15 of 16 episodes"),
+        (lambda entry: stated(entry, tolerance=1.0), "gives replayed: audit.json: tolerance is 1, expected at most"),
+        (lambda entry: stated(entry, asked="16"), 'audit.json: asked is "16", expected'),
+        (lambda entry: stated(entry, played=[-1]), "audit.json: played is [-1], expected"),
+        (lambda entry: (entry / "audit.json").write_text('{"run": 1}'), "expected an object of runs"),
+        (lambda entry: (entry / "audit.json").write_text('{"run": {"tolerance": NaN}}'), "NaN is not JSON"),
+        (lambda entry: (entry / "audit.json").write_bytes(b"\xff"), "not readable as JSON"),
+    ],
+    ids="none head faults nothing repeated picked few unpacked unasked part lax text negative shape nan bytes".split(),
+)
+def test_a_level_without_its_evidence_is_refused(audited, tmp_path, forge, named, capsys):
+    """An entry that claims more than bundle and audit.json give is one line with file and field, code 2, no page."""
+    entry = shutil.copytree(audited, tmp_path / "ours")
+    forge(entry)
+    code, said, site = build(entry, capsys)
+    assert code == 2 and named in said and str(entry) in said.splitlines()[-1] and not site.exists(), said
+
+
+def few(entry):
+    """Two episodes played again alone, truly drawn."""
+    with zipfile.ZipFile(entry / "bundle.zip") as archive:
+        archive.extractall(entry.parent / "run")
+    (found,) = [folder_audit.audited(entry.parent / "run")]
+    stated(entry, draw=7, played=[one.index for one in drawn(found, 2, 7)], asked=2)
+
+
+def actions_left_out(members):
+    """Actions of one episode not in the bundle."""
+    members.pop(next(name for name in members if name.startswith("actions/")))
+
+
 def test_a_bundle_stays_in_its_folder(entry, capsys):
     """A member of a bundle with another path or kind is refused, and nothing is written outside."""
     for name in ("../escaped.json", "/escaped.json", "actions/../../escaped.npz", "run.sh"):
@@ -238,6 +320,14 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         code, said, _ = build(entry, capsys)
         assert code == 2 and "is no file of a bundle" in said, said
         assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+def test_what_is_damaged_in_a_bundle_is_named_by_it(entry, capsys):
+    """A message about a file of a bundle names the bundle, not the folder into which it was unpacked."""
+    for name, said in (("config.json", "no results folder"), ("episodes.jsonl", "/episodes.jsonl: no such file")):
+        copied = shutil.copytree(entry, entry.parent / name)
+        repacked(copied, lambda members, name=name: members.pop(name))
+        assert f"error: {copied / 'bundle.zip'}" in (found := build(copied, capsys)[1]) and said in found
 
 
 def test_a_bundle_is_deflated_and_has_a_plain_name(entry, capsys):
@@ -252,6 +342,9 @@ def test_a_bundle_may_be_elsewhere(entry, capsys):
     """An entry with numbers of a table and the hash of a bundle that is not there is listed, and says so."""
     fill(entry, numbers="paper", rows=["act"])
     (entry / "bundle.zip").unlink()
+    code, said, site = build(entry, capsys)
+    assert code == 2 and "level is consistent, its evidence gives self-reported: no bundle.zip is there" in said
+    fill(entry, level="self-reported")
     code, said, site = build(entry, capsys)
     assert code == 0 and "is not part of this board" in said
     assert "is not part of this board" in (site / "ours.html").read_text()
@@ -268,9 +361,10 @@ def test_text_of_an_entry_stays_text(entry, capsys):
 
 
 def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
-    """The entries in leaderboard/ pass schema and audit, and the board names each."""
+    """The entries in leaderboard/ pass schema, audit and the replay of a short episode, and the board names each."""
     monkeypatch.chdir(ROOT)
-    assert main(["leaderboard", "build", "--out", str(tmp_path / "site")]) == 0, capsys.readouterr().out
+    flags = ["--replay", "1", "--draw", "10", "--out", str(tmp_path / "site")]
+    assert main(["leaderboard", "build", *flags]) == 0, capsys.readouterr().out
     text = (tmp_path / "site" / "index.html").read_text()
     entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
     assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)

@@ -11,6 +11,9 @@ if __name__ == "__main__":
     if what == "fail" and not mark.exists():
         mark.touch()
         sys.exit("a reason of its own")
+    if what == "refuse":
+        mark.open("a").write("x")
+        sys.exit(2)
     if what == "wait":
         signal.signal(signal.SIGTERM, lambda *_: (Path(f"{mark}.told").touch(), os._exit(3)))
         mark.write_text(str(os.getpid()))

@@ -16,7 +16,7 @@ from arena_newton.eval.suites.suite_file import read_suite_file
 def made(plan, out, **changes):
     """Commands of a plan by their names."""
     given = {"rows": [plan.rows[0]], "seeds": [1, 2, 3], "device": None, "gpus": 4, "minutes": lambda: 9.0}
-    given |= {"middle": lambda row: 2} | changes
+    given |= {"middle": lambda suites: (2, suites)} | changes
     return {str(command): command for command in plan_commands(plan, PlanFolders(out), **given)}
 
 
@@ -48,8 +48,9 @@ def test_rows_of_the_generalist_are_its_ablation():
         row.name: {name for name, value in vars(row.train).items() if value != getattr(first.train, name)}
         for row in others
     }
-    expected = {"none": {"looks", "recipe_values"}, "augmentation": {"looks"}, "shapes": {"look_changes"}}
-    expected |= {"light": {"look_changes"}, "plain-02": {"looks"}, "plain-06": {"looks"}, "untold": {"tracker_vector"}}
+    expected = {"none": {"looks", "look_changes", "recipe_values"}, "augmentation": {"looks", "look_changes"}}
+    expected |= {name: {"look_changes"} for name in ("shapes", "light", "keys-seldom")}
+    expected |= {"plain-02": {"looks"}, "plain-06": {"looks"}, "untold": {"tracker_vector"}}
     assert differ == expected | {"twist2": set(), "sonic": set()}
 
 
@@ -97,7 +98,7 @@ def test_what_is_there_is_continued(tmp_path):
 
 def test_several_gpus_train_one_network(tmp_path):
     """By torchrun where the plan gives a training several, as many as there are."""
-    text = (SHIPPED / "generalist.toml").read_text().replace("# one training on each GPU", "\ngpus = 2 #")
+    text = (SHIPPED / "generalist.toml").read_text().replace("# one training on each GPU;", "\ngpus = 2 #")
     (tmp_path / "two.toml").write_text(text)
     plan = read_plan(str(tmp_path / "two.toml"))
     words = made(plan, tmp_path)["train all_1"].words()
@@ -111,10 +112,14 @@ def test_trainings_have_the_time_that_recording_leaves(tmp_path):
     line = '{{"stage": "{}", "name": "a", "began": {}, "ended": {}, "code": 0}}\n'
     (tmp_path / "commands.jsonl").write_text(line.format("record", 0, 180) + line.format("build", 120, 240))
     assert training_minutes(plan, None, tmp_path, 3, 4) == 12.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 4) == 24.0 - 8.0 - 4.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 6.0
-    with pytest.raises(InputError, match="^--minutes 12: recording and building took 4.0, nothing is left to train in"):
-        training_minutes(plan, 12.0, tmp_path, 3, 4)
+    assert training_minutes(plan, 24.0, tmp_path, 3, 4) == 24.0 - 6.0 - 4.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 7.0
+    assert training_minutes(plan, 24.0, tmp_path, 2, 2) == 14.0
+    with pytest.raises(InputError, match="^--minutes 10: recording and building took 4.0, nothing is left to train in"):
+        training_minutes(plan, 10.0, tmp_path, 3, 4)
+    with (tmp_path / "commands.jsonl").open("a") as file:
+        file.write(line.format("train", 250, 310).replace('"code": 0', '"code": -9'))
+    assert training_minutes(plan, 24.0, tmp_path, 2, 2) == 13.0  # what a killed one took is gone
 
 
 BAD = [
@@ -198,10 +203,35 @@ def test_the_page_has_the_middle_of_the_trainings_and_their_bars(tmp_path):
                 cell = cell_of(f"all#{seed}", "act", tracker, "boxing", trained_on=("twist2", "sonic"), mode=mode)
                 cells.append((cell, outcomes(won - less)))
     write_suite(folders.suite(plan.rows[0]), cells)
-    assert plan_report.middle_seed(folders.suite(plan.rows[0])) == 3
+    assert plan_report.middle_training(folders.suites(plan.rows[0])) == (3, [folders.suite(plan.rows[0])])
     said = plan_report.write(plan, folders, [], "a command")
     assert "all: base: 107 of 120 (113 93 107) missed" in said and "all: visual: 107 of 120 (113 93 107) missed" in said
     assert "all: under its bar: boxing sonic base: 50 of 60, bar 54" in said
     assert not any("visual: 50" in line or "twist2" in line for line in said)
+    assert made(plan, tmp_path)["card all"].words()[3:5] == ["--out", str(tmp_path / "packed")]
     page = (tmp_path / "plan.md").read_text()
     assert "| boxing | twist2 | 60 50 57 | 60 50 57 |" in page and "Seeds of its trainings: 1 2 3." in page
+
+
+def test_trainings_of_several_machines_have_one_page(tmp_path):
+    """Suites that were put beside a row's own count with it: for its page, its tables, the middle one and its card."""
+    plan = read_plan("generalist")
+    folders, row = PlanFolders(tmp_path), plan.rows[0]
+    assert folders.suites(row) == []
+    for name, won in (("all", {1: 40, 2: 50}), ("all@2", {3: 45}), ("none@2", {1: 9})):
+        policies = {f"{name.partition('@')[0]}#{seed}": successes for seed, successes in won.items()}
+        cells = [
+            (cell_of(policy, "act", "twist2", "boxing", trained_on=("twist2",)), outcomes(successes))
+            for policy, successes in policies.items()
+        ]
+        write_suite(tmp_path / "evaluation" / name, cells)
+    suites = folders.suites(row)
+    assert [suite.name for suite in suites] == ["all", "all@2"]
+    assert plan_report.middle_training(suites) == (3, suites[:1])
+    commands = made(plan, tmp_path, middle=plan_report.middle_training)
+    assert commands["evaluate all"].done() and not made(plan, tmp_path, seeds=[1, 4])["evaluate all"].done()
+    assert commands["tables"].words()[2:4] == [str(suite) for suite in suites]
+    words = commands["card all"].words()
+    assert words[2] == str(tmp_path / "trainings" / "all_3")
+    assert words[words.index("--results") :] == ["--results", *map(str, suites), "--trainings", str(suites[0])]
+    assert "all: base: 45 of 60 (40 50 45) missed" in plan_report.write(plan, folders, [], "a command")

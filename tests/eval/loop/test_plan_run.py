@@ -63,6 +63,38 @@ def test_what_needs_a_failed_command_waits_for_the_next_call(tmp_path, capsys):
     }
 
 
+def test_what_some_failed_trainings_leave_is_played(tmp_path):
+    """A suite is played once all its trainings have ended, if one of them is whole; what needs all is not."""
+    marks = {name: tmp_path / name for name in "abcd"}
+    trainings = command("train", "a", "go", marks["a"], size=1), command("train", "b", "fail", marks["b"])
+    suite = command("evaluate", "", "go", marks["c"], ("train a", "train b"), needs_all=False)
+    alone = command("card", "", "go", marks["d"], ("train a", "train b"))
+    player = played(tmp_path / "out", [*trainings, suite, alone])
+    assert list(player.failed) == ["train b"] and marks["c"].exists() and not marks["d"].exists()
+    assert [one.name for one in command_times(tmp_path / "out")] == ["a", "b", ""]
+    none = command("train", "c", "fail", tmp_path / "e"), command("evaluate", "e", "go", tmp_path / "f", ("train c",))
+    played(tmp_path / "other", [none[0], dataclasses.replace(none[1], needs_all=False)])
+    assert not (tmp_path / "f").exists()
+
+
+def test_a_failed_command_is_begun_again(tmp_path, capsys):
+    """So often as the plan says; what needs it waits, and bad input is not tried twice."""
+    marks = {name: tmp_path / name for name in "abc"}
+    first = command("record", "a", "fail", marks["a"])
+    then = command("build", "a", "go", marks["b"], ("record a",))
+    wrong = command("record", "b", "refuse", marks["c"])
+    with held_folder(tmp_path / "out", "works in it") as held:
+        player = CommandPlayer(tmp_path / "out", (), {}, held, again=1)
+        assert not player.play([first, then, wrong])
+    assert list(player.failed) == ["record b"] and "exit code 2" in player.failed["record b"]
+    assert [(str(one.stage), one.code) for one in command_times(tmp_path / "out") if one.name == "a"] == [
+        ("record", 1),
+        ("record", 0),
+        ("build", 0),
+    ]
+    assert marks["b"].exists() and marks["c"].read_text() == "x"
+
+
 def test_gpus_are_taken_in_turn(tmp_path):
     """A command of one GPU has one that few others have, one of all has all, and one of none sees none."""
     marks = {name: tmp_path / name for name in "abcde"}

@@ -17,6 +17,7 @@ from arena_newton.eval.folders.run_folder import stored_options
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play import run
+from arena_newton.files.untrusted_files import file_digest
 from arena_newton.policies.learned import act_network, learned_card
 from arena_newton.policies.learned.learned_card import read_card
 from tests.made_packed import checkpoint, packed
@@ -329,6 +330,35 @@ def test_other_trainings_are_in_the_card(evaluated, tmp_path, capsys):
     assert len(re.findall(rf"^\| (?:base|boxing \| twist2 \| base) \| \d/4 \|.* \| {won} \|$", page, re.M)) == 2
     assert main(["pack", str(out), "--out", str(out), "--tasks", "boxing"]) == 0
     assert read_card(out).trainings == card.trainings
+
+    ours, config = tmp_path / "ours", json.loads((tmp_path / "again" / "config.json").read_text())
+    shutil.copytree(evaluated / "made", ours)
+    facts = json.loads((ours / "arena_policy.json").read_text())
+    (ours / "arena_policy.json").write_text(json.dumps(facts | {"datasets": [{"name": "boxing", "hash": "1"}]}))
+    command[1] = str(ours)
+    for name, code in {"boxing": 0, "vis_navi": 2}.items():  # recorded again, and of another task
+        config["config"]["policy_facts"] |= {"datasets": [{"name": name, "hash": "2"}]}
+        (tmp_path / "again" / "config.json").write_text(json.dumps(config))
+        assert main([*command, str(tmp_path / "again")]) == code
+    assert "is of another datasets" in capsys.readouterr().err
+    assert [one.recorded_again for one in (*read_card(out).trainings, other)] == [True, False]
+    assert "demonstrations recorded again)" in (out / "card.md").read_text()
+
+
+def test_results_of_a_checkpoint_are_those_of_its_packed_form(tmp_path):
+    """One that was packed before it was played is packed again with the results of the checkpoint itself."""
+    made, out = checkpoint(tmp_path / "made"), tmp_path / "packed"
+    assert main(["pack", str(made), "--out", str(out)]) == 0
+    assert (trained := read_card(out).trained_weights) == file_digest(made / "model.safetensors", 1 << 30)
+    assert main(["pack", str(out), "--out", str(tmp_path / "again")]) == 0
+    assert read_card(tmp_path / "again").trained_weights == trained != read_card(out).weights
+    flags = ["--device", "cpu", "--engine", "mujoco", "--seeds", "0", "--repeats", "2", "--task", "boxing"]
+    assert main([*flags, "--policy", f"learned:{out}", "--out", str(tmp_path / "r")], stand_ins()) == 0
+    config = json.loads((tmp_path / "r" / "config.json").read_text())
+    config["config"]["policy_facts"]["weights"] = trained  # as if `lerobot:` had played the checkpoint
+    (tmp_path / "r" / "config.json").write_text(json.dumps(config))
+    assert main(["pack", str(out), "--out", str(out), "--results", str(tmp_path / "r"), "--tasks", "boxing"]) == 0
+    assert [(one.task, one.episodes) for one in read_card(out).results] == [("boxing", 2)]
 
 
 @pytest.mark.parametrize(

@@ -240,6 +240,7 @@ def test_engine_of_a_cluster(monkeypatch, tmp_path):
     gpus = tmp_path / "gpus"
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(devices, "NVIDIA_DEVICES", gpus)
+    monkeypatch.setattr(devices, "DRIVERS", ())
     assert devices.cluster_engine("auto", None, None) == ("mujoco", "cpu")
     assert devices.cluster_engine("auto", None, 0.5) == ("warp", "cuda:0")
     assert devices.cluster_engine("auto", "cuda:3", None) == ("warp", "cuda:0")
