@@ -242,7 +242,8 @@ class GradientBenchOptions(PlainBenchOptions):
 
     what: tuple[str, ...] = ("all",)
     """Figures: ticks, closed loops, replay of whole episodes, reach of slopes through a kick, featherstone (Newton's
-    solver with its tape, on CUDA where there is one), or `all`."""
+    solver with its tape, on CUDA where there is one), flights (the ball of `ball_flight` next to the engine's),
+    transition (MuJoCo's `mjd_transitionFD` next to a converged solver's), or `all`."""
     tasks: Several[str] = ()
     """Tasks; all that have an expert when none are named."""
     trackers: Several[str] = QUICK_TRACKERS
@@ -251,3 +252,7 @@ class GradientBenchOptions(PlainBenchOptions):
     """States of each task and tracker."""
     loops: Several[str] = ("vis_navi", "sit_sofa", "football")
     """Tasks of closed loops and replays: the experts walk, sit down, and kick."""
+    episodes: int = field(default=1, metadata=bounds(1, 1000))
+    """Episodes of each task that are replayed."""
+    step: float = 1e-6
+    """Step of the differences of a closed loop."""

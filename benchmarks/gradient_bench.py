@@ -5,10 +5,12 @@ Beside them: a loop next to the episode that it replays, and how far slopes thro
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import cast
 
+import mujoco
 import numpy as np
 import torch
 
@@ -20,12 +22,13 @@ from arena_newton.eval.bench.timing import BenchFigure, Figures, chosen
 from arena_newton.eval.certification.checks.gradients import TICK_STEPS, Slopes, TickSlopes
 from arena_newton.interfaces import Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
-from arena_newton.robot.canonical import ACTION
+from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 from benchmarks.bench_options import GradientBenchOptions
 from benchmarks.featherstone_bench import featherstone_figures
+from benchmarks.flight_bench import flight_figures
 
 __all__ = ["slope_figures"]
 
@@ -34,8 +37,8 @@ BAR = 1e-5
 PARTS = ("positions", "velocities", "targets")
 LOOKS = 5
 """Ticks of an episode from which states are taken."""
-EVERY = 30
-"""Ticks between two of them: from 0.3 s of the episode on, until 2.7 s."""
+EVERY = 100
+"""Ticks between two of them: from 1 s of the episode on, until 9 s; hands grip things by then."""
 
 
 LOOPS = {10: 1e-3, 50: 1e-2, 200: 1e-2}
@@ -57,10 +60,12 @@ REACH_SCALES = (1e-3, 1e-2)
 MOVED = ("its start x", "its start y", "the kick's speed")
 REPLAY_BAR = 1e-4
 """Largest distance of a loop from the episode that it replays [m, rad]."""
+TRANSITION_EVERY = 20
+"""Ticks between two states at which MuJoCo's finite differences are compared."""
 FACTORS = ("friction", "mass", "mass:/World/Robot/torso_link", "kp", "kd")
 FACTOR_TICKS = 100
-STEP = 1e-6
-"""Step of the differences of a closed loop."""
+NUDGE = 1e-12
+"""Standard deviation by which joints start elsewhere in an episode that the engine itself plays again [rad]."""
 
 
 def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
@@ -69,14 +74,21 @@ def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
     items: dict[str, Figures] = {
         "ticks": lambda: (_tick(task, tracker, options.states) for tracker in options.trackers for task in every),
         "loops": lambda: (
-            _loop(task, tracker, ticks, bar, factors)
+            _loop(task, tracker, ticks, bar, factors, options.step)
             for tracker in options.trackers
             for task in options.loops
             for ticks, bar, factors in _lengths(task)
         ),
-        "replay": lambda: (_replay(task, tracker) for tracker in options.trackers for task in options.loops),
+        "replay": lambda: (
+            _replay(task, tracker, repeat)
+            for tracker in options.trackers
+            for task in options.loops
+            for repeat in range(options.episodes)
+        ),
         "reach": reach_figures,
         "featherstone": featherstone_figures,
+        "flights": flight_figures,
+        "transition": transition_figures,
     }
     for figures in chosen(options.what, items).values():
         yield from figures()
@@ -119,7 +131,9 @@ def _apart(slopes: Slopes) -> float:
     return 1.0 - float(torch.nn.functional.cosine_similarity(exact, estimated, dim=0))
 
 
-def _loop(task: str, tracker: str, ticks: int | None, bar: float, factors: Sequence[str] = ()) -> BenchFigure:
+def _loop(
+    task: str, tracker: str, ticks: int | None, bar: float, factors: Sequence[str] = (), step: float = 1e-6
+) -> BenchFigure:
     """Largest relative error of slopes of the pelvis' last position to actions, start and speeds, or to factors."""
     env = _world(task, tracker)
     for model in env.physics.models:
@@ -152,10 +166,10 @@ def _loop(task: str, tracker: str, ticks: int | None, bar: float, factors: Seque
     for which, (part, direction) in directions.items():
         with torch.no_grad():
             ends = [
-                number(*(a + side * STEP * direction if k == part else a for k, a in enumerate(at)))
+                number(*(a + side * step * direction if k == part else a for k, a in enumerate(at)))
                 for side in (1.0, -1.0)
             ]
-        estimated = float(ends[0] - ends[1]) / (2.0 * STEP)
+        estimated = float(ends[0] - ends[1]) / (2.0 * step)
         slope = float((gradients[part] * direction).sum())
         errors[which] = abs(slope - estimated) / max(abs(estimated), 1e-9)
     env.close()
@@ -187,23 +201,48 @@ class _Path(Recorder):
             self.actions.append(world.loop.action[0].clone())
 
 
-def _replay(task: str, tracker: str) -> BenchFigure:
-    """Largest distance of a closed loop from the expert's whole episode, whose actions it repeats."""
+def _replay(task: str, tracker: str, repeat: int = 0) -> BenchFigure:
+    """Largest distance of a closed loop from the expert's whole episode, whose actions it repeats.
+
+    Beside it that of the engine's own ticks, from joints that start 1e-12 rad elsewhere: all but the engine rounds to
+    float32 there, and a kick multiplies it.
+    """
     env = _world(task, tracker)
-    seed, path = seeding.episode_seed(tasks.get(task).gym_id, 0, 0), _Path()
+    seed, path = seeding.episode_seed(tasks.get(task).gym_id, 0, repeat), _Path()
     episodes = [SimpleNamespace(episode_seed=seed)]
     Rollout(env, policies.get("expert"), episodes, recorder=path, max_steps=LONGEST).run()
+    actions, recorded = torch.stack(path.actions), torch.from_numpy(np.stack(path.qpos))
     with torch.no_grad():
-        rolled = closed_loop(env, torch.stack(path.actions).double()[None], [seed], len(path.actions))
-    apart = (rolled.qpos[1:, 0] - torch.from_numpy(np.stack(path.qpos))).abs()
+        rolled = closed_loop(env, actions.double()[None], [seed], len(actions))
+    apart = (rolled.qpos[1:, 0] - recorded).abs()
+    nudged = (_nudged(env, seed, actions) - recorded).abs()
     root = env.scene.robot.root_qpos
-    note = f"{len(apart)} ticks; pelvis {float(apart[:, root : root + 3].max()):.0e} m"
+    note = f"episode {repeat}, {len(apart)} ticks; pelvis {float(apart[:, root : root + 3].max()):.0e} m"
     if task in KICKS:
-        note += f"; the ball, touched after {touch_of(env, rolled)}, "
+        touch = touch_of(env, rolled) - 1
+        note += f"; the ball, touched after {touch + 1}, "
         note += f"{float(apart[:, env.scene.joint_qpos(env.spec.target) :][:, :3].max()):.0e} m"
+        note += f"; before the touch {float(apart[:touch].max()):.0e}"
+    note += f"; the engine's own, nudged, {float(nudged.max()):.0e}"
     env.close()
     name = f"distance from the replayed episode, {task} through {tracker}"
     return BenchFigure(name, REPLAY_BAR, "m, rad", True, float(apart.max()), note)
+
+
+def _nudged(env: ArenaEnv, seed: int, actions: torch.Tensor) -> torch.Tensor:
+    """Positions after each tick of an episode that the environment itself plays, from joints that `NUDGE` moved."""
+    env.reset([seed])
+    data, joints = cast("MujocoPhysics", env.physics).data[0], env.scene.robot.joint_qpos
+    data.qpos[joints] += NUDGE * np.random.default_rng(0).standard_normal(len(joints))
+    for _ in range(env.startup_ticks):
+        env.step(torch.from_numpy(STAND_ACTION)[None])
+    env.observe()  # at step 0 the reference starts where the robot is
+    rows = []
+    for action in actions:
+        env.step(action[None])
+        rows.append(data.qpos.copy())
+    env.release([0])
+    return torch.from_numpy(np.stack(rows))
 
 
 def reach_figures() -> Iterator[BenchFigure]:
@@ -244,3 +283,37 @@ def _reach(env: ArenaEnv, seeds: Sequence[int], actions: torch.Tensor, touch: in
     note = "; ".join(f"{name} {exact:+.2f} ({near:+.2f}, {far:+.2f})" for name, exact, near, far, _ in rows)
     name = f"slopes through a kick that hold over 1 cm, {'soft onset' if soft else 'contacts as they are'}"
     return BenchFigure(name, 3.0 if soft else None, "of 3", False, float(found.holds.sum()), note)
+
+
+class _Transitions(Recorder):
+    """Distances of `mjd_transitionFD` at states of an episode from itself with a converged solver."""
+
+    def __init__(self) -> None:
+        self.apart: list[float] = []
+
+    def tick(self, env: World) -> None:
+        if env.tick[0] < 0 or env.tick[0] % TRANSITION_EVERY != TRANSITION_EVERY - 1:
+            return
+        physics = cast("MujocoPhysics", cast("ArenaEnv", env).physics)
+        found = []
+        for converged in (False, True):
+            model, data = copy.copy(physics.mj_model), copy.copy(physics.data[0])
+            if converged:
+                model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 100
+            found.append(np.empty((2 * model.nv, 2 * model.nv)))
+            mujoco.mjd_transitionFD(model, data, 1e-6, True, found[-1], None, None, None)
+        self.apart.append(float(np.linalg.norm(found[0] - found[1]) / np.linalg.norm(found[1])))
+
+
+def transition_figures() -> Iterator[BenchFigure]:
+    """Distance of MuJoCo's own finite differences of a step from those of a converged solver: the solver starts warm.
+
+    Of the matrix from state to next state, as a part of its Frobenius norm, in Football's episode until the touch.
+    """
+    env, looks = _world("football", "twist2"), _Transitions()
+    episodes = [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, 0, 0))]
+    Rollout(env, policies.get("expert"), episodes, recorder=looks, max_steps=LONGEST_KICK).run()
+    columns = 2 * (2 * env.physics.mj_model.nv)
+    env.close()
+    note = f"median {np.median(looks.apart):.0e}, {len(looks.apart)} states; {columns} steps each"
+    yield BenchFigure("mjd_transitionFD's distance from a converged solver's", None, "", True, max(looks.apart), note)

@@ -26,6 +26,7 @@ LIBRARIES = {
     "warp": "Warp, Newton and MuJoCo",
     "newton": "Warp, Newton and MuJoCo",
     "mujoco": "Warp, Newton and MuJoCo",
+    "rsl_rl": "rsl-rl",
     "pxr": "USD",
     "matplotlib": "matplotlib",
     "scipy": "SciPy",

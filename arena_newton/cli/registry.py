@@ -16,9 +16,15 @@ __all__ = ["Registry"]
 
 
 @functools.cache
+def _listed(path: tuple[str, ...]) -> importlib.metadata.EntryPoints:
+    """Entry points of all groups on a path; to look for them takes as long as hundreds of episodes' lines."""
+    return importlib.metadata.entry_points()
+
+
+@functools.cache
 def _installed(group: str, path: tuple[str, ...]) -> importlib.metadata.EntryPoints:
-    """Entry points of a group on a path; to look for them takes as long as hundreds of episodes' lines."""
-    return importlib.metadata.entry_points(group=group)
+    """Entry points of a group on a path."""
+    return _listed(path).select(group=group)
 
 
 class Registry[T]:

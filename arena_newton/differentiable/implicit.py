@@ -2,8 +2,9 @@
 
 The solver leaves an acceleration a at which inverse dynamics F(q, v, a), explicit in its arguments, equals the drives'
 torque. That equation is differentiated instead of the solver's iterations: forward is `mj_step` itself, backward solves
-once with dF/da, the Hessian of the solver's cost. The integrator adds (M - h D)(v' - v) = h M a with a constant D, and
-q' = q + h v' on the manifold. Gradients of positions are tangent, of length nv, where a name does not say qpos.
+once with dF/da, the Hessian of the solver's cost. The integrator adds (M - h D)(v' - v) = h M a and q' = q + h v', on
+the manifold; D is constant, but has -dC/dv too for a body that moves freely by itself. Gradients of positions are
+tangent, of length nv, where a name does not say qpos.
 
 dF/da = M + J' R J and dF/dv = dC/dv + J' R b J are closed: J the constraints' Jacobian, R their stiffness where they
 act and 0 elsewhere, b their damping (`efc_J`, `efc_D`, `efc_KBIP` of MuJoCo), C Coriolis and passive forces. Only dF/dq
@@ -160,6 +161,12 @@ class ImplicitWorld:
             for j, kind in enumerate(model.jnt_type.tolist())
             if kind in turning
         ]
+        self._alone = [
+            (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_bodyid[j]))
+            for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+            if (model.body_treeid == model.body_treeid[model.jnt_bodyid[j]]).sum() == 1
+        ]
+        """Address of position, of velocity, and body of each body that is a tree by itself."""
         self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
         self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
         self._mass_at = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
@@ -323,16 +330,20 @@ class ImplicitWorld:
         d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
         mujoco.mj_inverse(m, d)
         mass, jacobian, (rows, columns) = self._mass_matrix(), self._jacobian(), self._rate_at
-        y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
         stiffness, constrained = np.where(d.efc_state == _QUADRATIC, d.efc_D, 0.0), np.zeros_like(mass)
         mujoco.mju_sqrMatTD(constrained, jacobian, stiffness)
-        w = _solved(mass + constrained, y @ mass)
-        resisted = (stiffness * d.efc_KBIP[:, 1] * (w @ jacobian.T)) @ jacobian
+        stiffened = stiffness * d.efc_KBIP[:, 1]
         mujoco.mj_implicit(m, d)  # leaves qDeriv, and takes a step that nobody needs
         rates = np.zeros_like(mass)
         rates[rows, columns] = d.qDeriv
-        at_v = at_v - resisted + w @ rates
-        at_q = at_q + self._by_position(step, y, w, jacobian != 0.0)
+        y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
+        for _, dof, _ in self._alone:
+            own = slice(dof, dof + 6)
+            y[:, own] = h * np.linalg.solve((mass - h * rates)[own, own].T, at_v[:, own].T).T
+        w = _solved(mass + constrained, y @ mass)
+        at_v = at_v - (stiffened * (w @ jacobian.T)) @ jacobian + w @ rates
+        _, turned, spun = self._spinning(step, y)
+        at_q, at_v = at_q + turned + self._by_position(step, y, w, jacobian != 0.0), at_v + spun
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
         gain, bias, drive = m.actuator_gainprm[:, 0], m.actuator_biasprm, driven[:, self._dof]
@@ -341,6 +352,31 @@ class ImplicitWorld:
         stiff = drive * (gain * targets + bias[:, 1] * step.q[self._qadr])
         damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[:, self._dof])
         return at_q, at_v, gain * drive, np.stack([stiff, damped]), y, w
+
+    def _spinning(self, step: _Substep, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sum y · D (v' - v) of the bodies that move freely by themselves; its gradients to position and velocity.
+
+        Of such a body's centre at r, mass m and inertia I in its frame Q, C is m ω × (ω × r) as a force, in Q, and
+        ω × I ω as a torque about the centre.
+        """
+        m, at_q, at_v = self._inverse, np.zeros_like(y), np.zeros_like(y)
+        total, axes, frame = np.zeros(len(y)), np.empty(9), np.empty(9)
+        for qpos, dof, body in self._alone:
+            mujoco.mju_quat2Mat(frame, step.q[qpos + 3 : qpos + 7])
+            mujoco.mju_quat2Mat(axes, m.body_iquat[body])
+            main = axes.reshape(3, 3)
+            inertia, r, mass = main @ np.diag(m.body_inertia[body]) @ main.T, m.body_ipos[body], m.body_mass[body]
+            turn = slice(dof + 3, dof + 6)
+            spin, c, z = step.v[turn], step.change[turn], y[:, turn]
+            pull = y[:, dof : dof + 3] @ frame.reshape(3, 3)
+            p = pull + np.cross(z, r)
+            force = mass * (np.cross(c, np.cross(spin, r)) + np.cross(spin, np.cross(c, r)))
+            by_spin = mass * (np.cross(r, np.cross(p, c)) + np.cross(np.cross(c, r), p))
+            by_spin += np.cross(z, c) @ inertia + np.cross(inertia @ c, z)
+            total -= by_spin @ spin
+            at_v[:, turn] = -by_spin
+            at_q[:, turn] = -np.cross(force, pull)
+        return total, at_q, at_v
 
     def _jacobian(self) -> np.ndarray:
         """Jacobian of the constraints, shape [constraints, nv]."""
@@ -399,7 +435,7 @@ class ImplicitWorld:
             d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
             mujoco.mj_inverse(m, d)
             mujoco.mj_mulM(m, d, product, step.a - step.change / m.opt.timestep)
-            total += y @ product - w @ d.qfrc_inverse
+            total += y @ product - w @ d.qfrc_inverse + self._spinning(step, y)[0]
         return total
 
     def _tangent(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:

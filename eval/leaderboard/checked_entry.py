@@ -18,6 +18,7 @@ from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import SUITE_FILE, step_budgets
 from arena_newton.eval.records.identity import hash_path
 from arena_newton.eval.tables.condition_rates import (
+    IN_GMT,
     ConditionRate,
     rate_of_cell,
     rates_of_paper,
@@ -80,6 +81,8 @@ def check_entry(
         except InputError as error:
             raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
         checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
+        if entry.training_data == "none":  # a policy of many tasks without a merged training
+            checked.rates = [replace(rate, setting=IN_GMT) for rate in checked.rates]
         weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
         if cells and entry.checkpoint != weights:
             checked.faults.append(f"{where}: checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}")
@@ -160,10 +163,11 @@ def _audit(
 
 
 def _unusual(cell: PlayedCell) -> str:
-    """Conditions of a cell that are not the protocol's, in words."""
+    """Conditions of a cell that are not the protocol's, or not those of a policy that sees pictures, in words."""
     drive = plain(cell.run.config.get("drive", "auto"))
-    found = [f"drive {drive}"] * (drive != "auto") + ["fast physics"] * bool(cell.run.config.get("fast_physics"))
     config = cell.run.config
+    found = ["sees the simulator's state"] * bool((config.get("policy_facts") or {}).get("privileged"))
+    found += [f"drive {drive}"] * (drive != "auto") + ["fast physics"] * bool(config.get("fast_physics"))
     if tuple(config["seeds"]) != PROTOCOL_SEEDS or config["repeats"] != PROTOCOL_REPEATS:
         found.append(f"seeds {' '.join(map(str, config['seeds'][:9]))}, {counted(config['repeats'], 'repeat')} of each")
     found += [f"rules {plain(config['rules'])}"] * (config["rules"] != PROTOCOL_RULES)

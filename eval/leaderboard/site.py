@@ -141,7 +141,6 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
     text = render(
         index, styles=styles, script="board.js", sections=sections, filters=filters, columns=columns, levels=LEVELS
     )
-    _write(out / "index.html", text.encode())
     for one, folder in zip(entries, folders, strict=True):
         own = [_Section(section.title, "", [r for r in section.rows if r.checked is one]) for section in sections]
         strips = []
@@ -154,7 +153,7 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
         if bundle:
             _write(out / bundle, read_regular(folder / BUNDLE_FILE, MAX_BUNDLE_BYTES))
         failures = [cell for audit in one.audits for cell in audit.results.get("failures", [])]
-        text = render(
+        page = render(
             FOLDER / "entry.html",
             styles=styles,
             sources=FILES,
@@ -168,7 +167,8 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
             strips=strips,
             bundle=bundle,
         )
-        _write(out / f"{one.name}.html", text.encode())
+        _write(out / f"{one.name}.html", page.encode())
+    _write(out / "index.html", text.encode())  # last: all that it links to is there
 
 
 def _facts(one: CheckedEntry) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ from arena_newton.eval.tables.episode_table import EvaluatedCell
 from arena_newton.eval.tables.paper_numbers import TRAINING_SETS, PaperRate, PublishedRow, paper_numbers
 from arena_newton.eval.tables.suite_tables import tracker_order
 
-__all__ = ["SETTINGS", "ConditionRate", "rate_of_cell", "rates_of_paper", "rates_of_published"]
+__all__ = ["IN_GMT", "SETTINGS", "ConditionRate", "rate_of_cell", "rates_of_paper", "rates_of_published"]
 
 IN_GMT, CROSS_GMT, MERGED = "in-GMT", "cross-GMT", "merged"
 SETTINGS = {

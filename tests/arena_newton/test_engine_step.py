@@ -51,12 +51,15 @@ def cosine(a, b):
 
 @pytest.mark.parametrize("task", tasks.names())
 def test_a_tick_has_the_slopes_of_differences(task):
-    """In every scene, slopes to positions, velocities and targets are those of centred differences, in contact."""
+    """In every scene, slopes to positions, velocities and targets are those of differences: in contact, things spin."""
     built, rng = scene(task), np.random.default_rng(3)
     physics = stood(built)
     model, exact, precise = physics.mj_model, EngineStep(physics), EngineStep(physics, converged=True)
     state = exact.state()
     assert physics.data[0].ncon >= 4
+    for dof in model.jnt_dofadr[(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)].tolist():
+        if dof != built.robot.root_qvel:
+            state.qvel[0, dof + 3 : dof + 6] = torch.tensor([2.0, -1.0, 1.5])
     targets = physics.data[0].ctrl + 0.05 * rng.normal(size=(1, model.nu))
     targets[0, built.robot.joint_ctrl[3]] += 5.0  # the left knee's torque is at its limit
     leaves = [leaf.clone().requires_grad_() for leaf in (state.qpos, state.qvel, torch.from_numpy(targets))]
@@ -103,6 +106,22 @@ def test_factors_of_the_model_over_a_run():
         estimate = [(ended(precise, 1 + move[None]) - ended(precise, 1 - move[None])) / 2e-5 for move in moves]
     assert gradient.abs().min() > 1e-4
     torch.testing.assert_close(gradient[0], torch.stack(estimate), rtol=1e-3, atol=1e-5)
+
+
+def test_the_mass_of_what_spins_does_not_matter():
+    """A hammer that spins in the air about a centre that is not its origin moves alike at any mass: the slope is 0."""
+    built = scene("double_desk")
+    physics = stood(built, ticks=1)
+    step = EngineStep(physics, ("mass:/World/Hammer",))
+    begin, targets = step.state(), torch.from_numpy(physics.data[0].ctrl.copy())[None]
+    speed = built.joint_qvel("/World/Hammer")
+    begin.qpos[0, built.joint_qpos("/World/Hammer") + 2] += 1.0
+    begin.qvel[0, speed + 3 : speed + 6] = torch.tensor([2.0, -3.0, 4.0])
+    factor = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    after = step(begin, targets, factor).qvel[0, speed : speed + 6]
+    (gradient,) = torch.autograd.grad(after.sum(), factor)
+    assert (after - begin.qvel[0, speed : speed + 6])[3:].abs().max() > 1e-3  # the axis turns
+    assert abs(float(gradient)) < 1e-8
 
 
 def test_friction_moves_a_ball_that_hops_on_the_grass():

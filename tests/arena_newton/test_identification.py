@@ -68,6 +68,16 @@ def test_a_robot_is_known_from_windows(physics, recorded):
     assert len(list(windows.fit(guess, spread, iterations=2, starts=False))) <= 2
 
 
+def test_a_window_astray_is_left_out(physics, recorded):
+    """Targets that are wrong in one of two windows do not count in the end, and the numbers are those of the other."""
+    targets = recorded.targets.clone()
+    targets[12:16, physics.scene.robot.joint_ctrl[:6]] += 0.3
+    windows = Windows(physics, recorded._replace(targets=targets), NAMES, ticks=7)
+    *_, last = windows.fit(torch.tensor([0.0, 0.0, 0.0, 0.5]).double(), torch.full((4,), 0.3).double())
+    assert last.kept.tolist() == [True, False] and last.misfit < 1.2
+    assert (last.numbers - TRUTH).abs().max() < 0.15
+
+
 def test_a_recording_that_is_too_short(physics, recorded):
     """Windows that reach beyond the recording are refused with both numbers."""
     with pytest.raises(InputError, match="20 ticks recorded, 24 needed"):

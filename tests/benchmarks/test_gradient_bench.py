@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arena_newton.robot.canonical import STAND_ACTION
-from benchmarks import gradient_bench
+from benchmarks import flight_bench, gradient_bench
 from benchmarks.bench_options import GradientBenchOptions
 
 
@@ -33,7 +33,8 @@ def test_a_loop_is_compared_with_the_episode_that_it_replays(monkeypatch):
     """The distance is that of whole positions; a loop that starts elsewhere misses its bar."""
     monkeypatch.setattr(gradient_bench, "LONGEST", 5)
     found = gradient_bench._replay("vis_navi", "pd")
-    assert found.verdict == "pass" and found.note.startswith("5 ticks; pelvis ")
+    assert found.verdict == "pass" and found.note.startswith("episode 0, 5 ticks; pelvis ")
+    assert found.note.endswith("; the engine's own, nudged, 1e-12")
     honest = gradient_bench.closed_loop
 
     def off(*given):
@@ -54,3 +55,12 @@ def test_what_holds_through_a_kick_is_counted():
     with pytest.raises(gradient_bench.InputError, match="football: the expert touches nothing within 4 ticks"):
         gradient_bench.touch_of(env, still)
     env.close()
+
+
+def test_flights_and_mujocos_differences_are_figures(monkeypatch):
+    """A short kick is a centimetre off at most; differences with the engine's solver are near a converged one's."""
+    monkeypatch.setattr(gradient_bench, "LONGEST_KICK", 21)
+    monkeypatch.setattr(flight_bench, "KICKS", ((2.0, 0.0, 0.0),))
+    flight, transition = gradient_bench.slope_figures(GradientBenchOptions(what=("flights", "transition")))
+    assert 0.0 < flight.value < 1.0 and flight.unit == "cm"
+    assert 0.0 <= transition.value < 1.0 and "1 states" in transition.note

@@ -368,6 +368,7 @@ def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
     text = (tmp_path / "site" / "index.html").read_text()
     entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
     assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)
+    assert "<h2>merged</h2>" not in (tmp_path / "site" / "expert.html").read_text()  # an untrained policy of many tasks
     for title in ("in-GMT", "in-GMT, other modes", "cross-GMT", "merged"):
         assert f"<h2>{title}</h2>" in text
     assert text.index("WB-WAM") < text.index("Diffusion Policy (paper)") and "in Isaac Sim" in text
