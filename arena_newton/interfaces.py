@@ -251,6 +251,7 @@ class Tracker(Protocol):
     max_root_delta_deg: float
     needs: Sequence[str]
     lookahead: int
+    loop: int
 
     def rate(self, *, fast: bool = False) -> PhysicsRate:
         """Physics step and substeps per tick."""

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
 
 from arena_newton.cli.registry import Registry
+from arena_newton.errors import InputError
+from arena_newton.files.stored_json import is_name
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 
-if TYPE_CHECKING:
-    import numpy as np
+__all__ = ["Metric", "check", "check_names", "get", "names", "register", "unregister"]
 
-__all__ = ["Metric", "check", "get", "names", "register", "unregister"]
+Fold = Literal["highest", "lowest", "mean", "total", "last"]
+FOLDS = get_args(Fold)
+"""Ways in which values make a metric."""
 
 RECORDERS: Registry[Recorder] = Registry("recorder", "arena_newton.recorders", lambda: Recorder, {})
 """Makers of recorders, such as their classes; each takes the environment."""
@@ -30,16 +36,38 @@ def get(name: str, env: World) -> Recorder:
     return RECORDERS.make(name, env)
 
 
+def check_names(recorders: Sequence[Recorder]) -> None:
+    """Refuse metrics of one name, of which the journal would hold the last.
+
+    Raises:
+        InputError: Two have the same; the message names their classes.
+    """
+    found: dict[str, Metric] = {}
+    for metric in (one for one in recorders if isinstance(one, Metric)):
+        if (other := found.setdefault(metric.name, metric)) is not metric:
+            kinds = [f"{kind.__module__}.{kind.__qualname__}" for kind in (type(other), type(metric))]
+            raise InputError(f"metric {metric.name}: is the name of {kinds[0]} and of {kinds[1]}; rename one of them")
+
+
 class Metric(Recorder):
     """A number per world and tick, of whose values an episode's metric is made; a subclass writes `measure`."""
 
     name: str
     """Name in journal and tables."""
-    fold: Literal["highest", "lowest", "mean", "total", "last"] = "highest"
+    fold: Fold = "highest"
     """Way in which the values since step 0 make the metric; one that is NaN does not count."""
 
     def __init__(self, env: World):
-        """Begin without values."""
+        """Begin without values.
+
+        Raises:
+            InputError: The class has no name, or a fold that is not one.
+        """
+        kind = type(self).__name__
+        if not is_name(getattr(self, "name", "")):
+            raise InputError(f"metric {kind}: its `name` is {getattr(self, 'name', '')!r}, expected a name for tables")
+        if self.fold not in FOLDS:
+            raise InputError(f"metric {self.name} ({kind}): its `fold` is {self.fold!r}, expected {', '.join(FOLDS)}")
         self._values: list[list[float]] = [[] for _ in range(env.worlds)]
 
     def measure(self, env: World) -> np.ndarray:
@@ -52,7 +80,13 @@ class Metric(Recorder):
 
     def tick(self, env: World) -> None:
         """See `Recorder.tick`."""
-        measured = self.measure(env).tolist()
+        found = np.asarray(self.measure(env))
+        if found.shape != (env.worlds,):
+            kind = f"metric {self.name} ({type(self).__name__})"
+            raise InputError(
+                f"{kind}: measure() gives shape {list(found.shape)}, expected [{env.worlds}], one per world"
+            )
+        measured = found.tolist()
         for world in range(env.worlds):
             if env.active[world] and env.tick[world] > 0 and not math.isnan(measured[world]):
                 self._values[world].append(measured[world])

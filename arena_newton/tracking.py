@@ -12,6 +12,7 @@ Tasks, rules and episodes are unknown here, and the physics step is the caller's
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 __all__ = ["TrackerLoop", "WorldMask"]
 
 JOINTS = len(g1.MUJOCO_JOINTS)
+NUMBERS = itertools.count(1)
+"""Numbers of the loops, by which a tracker knows the one that it belongs to."""
 
 
 class WorldMask:
@@ -134,6 +137,14 @@ class TrackerLoop:
         self._integrate, self._drive = record(self._launch_integrate), record(self._launch_drive)
         self._takes_mask = "mask" in inspect.signature(tracker.step).parameters
         tracker.bind(self.worlds, self.torch_device)
+        self._number = next(NUMBERS)
+        tracker.loop = self._number
+
+    def _check_tracker(self) -> None:
+        """Refuse to go on with a tracker that another loop has bound since: its past would be that of other worlds."""
+        if self.tracker.loop != self._number:
+            why = "another environment has bound this object since; make a tracker for each environment"
+            raise InputError(f"tracker {self.tracker.name}: {why}")
 
     def _give(self, needs: Sequence[str]) -> None:
         """Give the tracker the further fields that it declares; all but the window are live views."""
@@ -194,7 +205,11 @@ class TrackerLoop:
             mask: Worlds whose history ends.
             prefill: Fill the history with the first frame at the next tick, instead of leaving it as the tracker's
                 `reset` made it.
+
+        Raises:
+            InputError: Another loop has bound the tracker since.
         """
+        self._check_tracker()
         self.tracker.reset(self._chosen.choose(mask).torch)
         self._prefill[mask] = prefill
         for late in self._late or ():
@@ -275,8 +290,10 @@ class TrackerLoop:
             `self.targets`.
 
         Raises:
-            InputError: The tracker's answer is not a float32 tensor of one row per world.
+            InputError: The tracker's answer is not a float32 tensor of one row per world, or another loop has bound the
+                tracker since.
         """
+        self._check_tracker()
         ticking = self._ticking.choose(mask).torch
         if action is not self.action:
             self.action.copy_(action)

@@ -125,6 +125,26 @@ def test_packages_say_what_they_show():
         assert f"uv pip install -e examples/{folder.name}\n" in "".join([*texts, page])
 
 
+def test_a_mode_of_a_package_is_studied_and_certified(installed, tmp_path, capsys):
+    """A mode of another package is known by name to the map, the search and the certificate, which says what moves."""
+    installed(ROOT / "examples" / "new_mode")
+    names = "--task boxing --mode wet".split()
+    short = [*names, *"--policy stand --max-steps 4 --engine mujoco --out".split()]
+    assert main(["sensitivity", *short, str(tmp_path / "map"), *"--axes dynamics.friction --grid 2".split()]) == 0
+    assert [axis["grid"] for axis in json.loads((tmp_path / "map" / "sensitivity.json").read_text())["axes"]] == [
+        [0.2, 0.5]
+    ]
+    search = "--axes boxing_target.z dynamics.friction --batch 10 --batches 1 --confirm 1".split()
+    assert main(["adversary", *short, str(tmp_path / "search"), *search]) == 0
+    found = json.loads((tmp_path / "search" / "adversary.json").read_text())
+    height, friction = found["worst"]["values"]
+    assert 0.65 <= height <= 0.95 and 0.2 <= friction <= 0.5
+    checks = [*names, *"--checks modes --episodes 1 --tracker twist2 --out".split(), str(tmp_path / "certify")]
+    assert main(["certify", *checks]) == 0
+    moved = "modes         wet moves boxing_target z, dynamics friction; nothing else"
+    assert moved in capsys.readouterr().out
+
+
 def test_packages_of_a_mode_a_metric_and_a_policy_play(installed, tmp_path, capsys):
     """Installed, they are known by name: one run has all three, goes on, and is played again with its metric."""
     for name in ("new_metric", "new_mode", "new_policy"):

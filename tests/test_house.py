@@ -110,7 +110,7 @@ MOST_LINES = 600
 MOST_FILES = 20
 STEMS = {
     "base": "the base class of a room's kind of thing",
-    **dict.fromkeys(tasks.names(), "a task, its expert and the builder of its scene"),
+    **dict.fromkeys(tasks.OWN, "a task, its expert and the builder of its scene"),
     "g1": "the robot, and the builder of its layer",
     "lab": "the worlds of the tracker suite, and the builder of their scene",
     "rotations": "those of kernels in Warp, those of everybody else in torch and NumPy",

@@ -65,6 +65,8 @@ class Tracker:
     """Ticks after this one whose reference it reads in `TrackerCommand.ahead`."""
     worlds: int = 0
     """Worlds this tracker is bound to."""
+    loop: int = 0
+    """Number of the loop that it belongs to, the last that bound it."""
 
     def rate(self, *, fast: bool = False) -> PhysicsRate:
         """Physics step and substeps per tick."""

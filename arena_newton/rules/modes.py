@@ -97,6 +97,18 @@ class Mode:
         """True if its pictures differ from those of base mode."""
         return self.scene != "base" or self.light is not None
 
+    def range_of(self, rule: ObjectRule) -> PoseRange | CylinderRange:
+        """Range from which an object's placement is drawn.
+
+        Raises:
+            InputError: It is of another kind than the object's base range.
+        """
+        found = self.placements(rule)
+        if type(found) is not type(rule.base):
+            kinds = f"{type(found).__name__}, expected a {type(rule.base).__name__}"
+            raise InputError(f"mode {self.name}: placements of {rule.record}: {kinds} as its base range is")
+        return found
+
     def draw(self, episode_seed: int) -> dict[str, float]:
         """Dynamics of an episode: one value per range, each by a generator of its own."""
         found = {}
@@ -108,7 +120,7 @@ class Mode:
     def hash_for(self, rules: RuleSet, tasks: Iterable[str]) -> str:
         """Hash of its ranges and of its scene's name, for some tasks under a rule set: 12 hex digits."""
         objects = [one for task in sorted(tasks) for one in rules.task(task).objects]
-        ranges = [[one.record, dataclasses.asdict(self.placements(one))] for one in objects]
+        ranges = [[one.record, dataclasses.asdict(self.range_of(one))] for one in objects]
         light = None if self.light is None else dataclasses.asdict(self.light(rules))
         text = json.dumps([self.scene, ranges, light, sorted(self.dynamics.items())], separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:12]

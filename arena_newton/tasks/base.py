@@ -220,7 +220,7 @@ def sample_pose(rng: np.random.Generator, ranges: PoseRange, order: tuple[str, .
 
 def object_range(rule: ObjectRule, mode: str) -> PoseRange | CylinderRange:
     """The range that applies in a mode."""
-    return modes.get(mode).placements(rule)
+    return modes.get(mode).range_of(rule)
 
 
 def sample_objects(episode_seed: int, mode: str, rules: TaskRules) -> dict[str, Sample]:

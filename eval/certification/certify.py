@@ -29,6 +29,7 @@ from arena_newton.eval.certification.checks import (
     legs,
     lens,
     machines,
+    named_modes,
     replays,
     rule_ticks,
     sill,
@@ -48,6 +49,7 @@ from arena_newton.eval.records.journal import ContradictionError
 from arena_newton.eval.reports.progress import duration
 from arena_newton.files.text import plain_text
 from arena_newton.physics.devices import resolve_engine
+from arena_newton.rules import modes
 
 __all__ = ["CHECKS", "run"]
 
@@ -57,6 +59,7 @@ CHECKS: tuple[Check, ...] = (
     *inputs.CHECKS,
     *legs.CHECKS,
     *axes.CHECKS,
+    *named_modes.CHECKS,
     *closed_forms.CHECKS,
     *lens.CHECKS,
     *rule_ticks.CHECKS,
@@ -145,7 +148,14 @@ def _chosen(options: CertifyOptions, checks: Sequence[Check]) -> list[Check]:
     for name in options.checks:
         if name not in known:
             raise InputError(f"--checks {name}: unknown, choose from {' '.join(known)}")
-    return [check for check in checks if not options.checks or check.name in options.checks]
+    for name in options.mode:
+        modes.get(name)
+    if not options.mode and named_modes.NAME in options.checks:
+        raise InputError(f"--checks {named_modes.NAME}: name the modes by --mode")
+    unnamed = () if options.mode else (named_modes.NAME,)
+    return [
+        check for check in checks if (check.name in options.checks if options.checks else check.name not in unnamed)
+    ]
 
 
 def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str, Body]) -> Context:

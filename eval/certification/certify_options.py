@@ -14,9 +14,9 @@ __all__ = ["CertifyOptions"]
 class CertifyOptions(Jobs):
     """Measure what the benchmark claims of itself: solvable tasks that need legs, clean axes, engines that agree.
 
-    The tasks' experts play in all checks but policy-inputs, execution, dynamics, physics, camera and statistics. Exit
-    code 0: no check fails; 1: one fails; 2: bad input. --jobs 0 only plays and writes no page, as each of several
-    processes does.
+    The tasks' experts play in all checks but policy-inputs, execution, dynamics, modes, physics, camera and
+    statistics. Exit code 0: no check fails; 1: one fails; 2: bad input. --jobs 0 only plays and writes no page, as each
+    of several processes does.
     """
 
     out: str = "results/certify"
@@ -29,8 +29,10 @@ class CertifyOptions(Jobs):
     """Trackers, with the weights they come with; the first one alone where one is enough."""
     checks: Several[str] = ()
     """Names of checks to run: journal recording solvable policy-inputs tracker-inputs frozen-legs gliding-base visual
-    semantic execution dynamics physics camera rules engines batches official shards ray swap visible sill failures
-    statistics gradients; all when none is named."""
+    semantic execution dynamics modes physics camera rules engines batches official shards ray swap visible sill
+    failures statistics gradients; all when none is named, modes only with --mode."""
+    mode: Several[str] = ()
+    """Modes whose records check `modes` compares with what they move, such as those of other packages."""
     episodes: int | None = None
     """Episodes of each cell: 60, the protocol's, or 2 under --quick."""
     worlds: int = 20

@@ -60,7 +60,7 @@ CLAIMS = (
     Claim("Experts need their legs, but where a gliding base is known to do.", ("frozen-legs", "gliding-base")),
     Claim(
         "Each axis of generalisation moves what its name says, and nothing else.",
-        ("visual", "semantic", "execution", "dynamics"),
+        ("visual", "semantic", "execution", "dynamics", "modes"),
     ),
     Claim("Another tracker costs success although nothing else changes.", ("swap",)),
     Claim("The trackers' weights that come with the package are as good as the official ones.", ("official",)),

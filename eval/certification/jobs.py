@@ -57,7 +57,7 @@ COMPARING = (
 """It, and the checks that compare with its evaluations."""
 BY_NAME = "engines"
 """The check that without CUDA is skipped unless it is named: a process that plays it for others would name it."""
-BY_FIRST = ("visual", "execution", "dynamics", "visible", "policy-inputs", "rules")
+BY_FIRST = ("visual", "execution", "dynamics", "modes", "visible", "policy-inputs", "rules")
 """Checks that play through the first tracker alone."""
 BY_ALL = ("official", "swap")
 """Checks whose measurements of a task are not apart by tracker."""

@@ -312,8 +312,10 @@ def resolve(options: RunOptions) -> RunConfig:
     for tracker in used:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
-    for recorder in options.recorder:
+    for number, recorder in enumerate(options.recorder):
         recorders.check(recorder)
+        if recorder in options.recorder[:number]:
+            raise InputError(f"--recorder {recorder}: given twice")
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"

@@ -36,5 +36,11 @@ class Factories:
     """Recorders of an environment, made once for it; their metrics are in the journal (`EpisodeResult.extra`)."""
 
     def measuring(self, env: World, named: Sequence[str]) -> list[Recorder]:
-        """Recorders of an environment: those of the program, then those of `--recorder`."""
-        return [*self.recorders(env), *(recorders.get(name, env) for name in named)]
+        """Recorders of an environment: those of the program, then those of `--recorder`.
+
+        Raises:
+            InputError: A recorder cannot be made, or two metrics have one name.
+        """
+        found = [*self.recorders(env), *(recorders.get(name, env) for name in named)]
+        recorders.check_names(found)
+        return found

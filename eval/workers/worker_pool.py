@@ -8,6 +8,7 @@ import functools
 import math
 import os
 import pickle
+import re
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -47,6 +48,8 @@ POLL = 1.0
 """Deadlines and lost processes are looked at so often [s]."""
 PATIENCE = 30.0
 """While no process has begun, a line says so as often [s]."""
+UNKNOWN = re.compile(r"--\w+ \S+: unknown")
+"""Beginning of a process's message about a name that nobody offers in it."""
 
 
 @dataclass(eq=False)
@@ -186,6 +189,9 @@ class WorkerPool:
                 if worker.job is not job:
                     self.prepare(worker, job)
             for _, _, message in self.messages():
+                if isinstance(message, ArenaError) and (unknown := UNKNOWN.match(str(message))):  # but known here
+                    why = f"this program offers it in its own process alone, and {self.backend.flag} plays in others"
+                    raise InputError(f"{unknown[0]} there: {why}; offer it as an entry point") from message
                 if isinstance(message, ArenaError):
                     raise message
         return job.configured()

@@ -5,7 +5,7 @@ More: docs/howto/bring/add_a_task.md.
 
     uv pip install -e examples/new_mode
     python -m arena_newton.eval --task football --mode base wet --tracker twist2 --seeds 0 --repeats 20
-    python -m arena_newton.certify --task football --checks dynamics
+    python -m arena_newton.eval certify --task football --mode wet --checks modes
 """
 
 from arena_newton.rules.modes import Mode

@@ -143,6 +143,16 @@ def test_hands_can_be_chosen(env):
         ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", device="cpu", hands="claws")
 
 
+def test_a_tracker_belongs_to_one_environment():
+    """One object in a second environment is refused in the first, where its past would be that of other worlds."""
+    tracker, options = trackers.get("pd"), {"engine": "mujoco", "device": "cpu", "fast_physics": True}
+    first, second = (ArenaEnv("football", tracker=tracker, worlds=worlds, **options) for worlds in (2, 1))
+    second.reset([1])
+    second.step(np.tile(STAND_ACTION, (1, 1)))
+    with pytest.raises(InputError, match="tracker pd: another environment has bound this object since; make a tracker"):
+        first.reset([1, 2])
+
+
 def test_a_drive_can_be_chosen():
     """A drive given by hand reaches the actuators; `released` takes the original's for a checkpoint that has one."""
     tracker = trackers.get("pd")

@@ -42,7 +42,11 @@ def test_a_metric_folds_the_values_of_an_episode(fold, found):
 
 def test_recorders_are_known_by_name():
     """A class that was registered makes recorders; a metric that measures nothing and an unknown name are named."""
-    recorders.register("blind", Metric)
+
+    class Blind(Metric):
+        name = "blind"
+
+    recorders.register("blind", Blind)
     try:
         made = recorders.get("blind", SimpleNamespace(worlds=1))
         assert isinstance(made, Metric) and "blind" in recorders.names()
@@ -50,3 +54,21 @@ def test_recorders_are_known_by_name():
         recorders.unregister("blind")
     with pytest.raises(InputError, match="--recorder blind: unknown recorder"):
         recorders.check("blind")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "metric Odd: its `name` is '', expected a name"),
+        ({"name": "odd", "fold": "median"}, r"metric odd \(Odd\): its `fold` is 'median', expected highest, "),
+        (
+            {"name": "odd", "measure": lambda self, env: 1.0},
+            r"metric odd \(Odd\): measure\(\) gives shape \[\], expected",
+        ),
+    ],
+)
+def test_a_metric_that_is_not_whole_is_named(given, said):
+    """A metric without a name, with an unknown fold or with values that are not one per world is an error by name."""
+    env = SimpleNamespace(worlds=2, active=np.array([True, True]), tick=np.array([1, 1]))
+    with pytest.raises(InputError, match=said):
+        type("Odd", (Metric,), given)(env).tick(env)

@@ -27,7 +27,7 @@ from arena_newton.rules import modes
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange
 from arena_newton.tasks.handles import RobotHandles
 
-__all__ = ["CHECKS", "allowed_difference", "moved_coordinates", "named_coordinates"]
+__all__ = ["CHECKS", "allowed_difference", "fills", "moved_coordinates", "named_coordinates", "shown_range", "stand"]
 
 TRACED = (2, 4)
 """Episodes of each task whose bits are compared, under --quick and otherwise."""
@@ -137,14 +137,14 @@ def semantic(context: Context) -> CheckFinding:
     return CheckFinding("fail" if outside else "pass", summary, (sheet,), (*outside, note))
 
 
-def named_coordinates(rule: ObjectRule) -> set[str]:
-    """Sampled numbers of an object whose range execution mode changes, as the rules name them."""
-    base, execution = rule.base, rule.execution
-    if isinstance(base, PoseRange) and isinstance(execution, PoseRange):
-        return {axis for axis in ("x", "y", "z", "yaw") if getattr(base, axis) != getattr(execution, axis)}
-    assert isinstance(base, CylinderRange) and isinstance(execution, CylinderRange)
-    named = {"z"} if base.z != execution.z else set()
-    around = (base.centers, base.radius, base.azimuth) != (execution.centers, execution.radius, execution.azimuth)
+def named_coordinates(rule: ObjectRule, mode: modes.Mode = modes.BUILT_IN["execution"]) -> set[str]:
+    """Sampled numbers of an object whose range a mode changes, as its record and the rules name them."""
+    base, other = rule.base, mode.range_of(rule)
+    if isinstance(base, PoseRange) and isinstance(other, PoseRange):
+        return {axis for axis in ("x", "y", "z", "yaw") if getattr(base, axis) != getattr(other, axis)}
+    assert isinstance(base, CylinderRange) and isinstance(other, CylinderRange)
+    named = {"z"} if base.z != other.z else set()
+    around = (base.centers, base.radius, base.azimuth) != (other.centers, other.radius, other.azimuth)
     return named | ({"bag", "azimuth", "x", "y"} if around else set())
 
 
@@ -159,12 +159,12 @@ def moved_coordinates(task: str, mode: str, rules: str, seeds: Iterable[int]) ->
     moved = set()
     for seed in seeds:
         base, other = spec.draw(seed, "base", rule_set).sampled, spec.draw(seed, mode, rule_set).sampled
-        if base.keys() != other.keys():
+        if base.keys() != other.keys() - {modes.DYNAMICS}:
             raise InputError(f"task {task}: mode {mode} draws other objects than base")
         for record, sample in other.items():
             for axis, value in sample.items():
                 values.setdefault((record, axis), []).append(value)
-                if base[record].get(axis) != value:
+                if base.get(record, {}).get(axis) != value:
                     moved.add((record, axis))
     return {key: values[key] for key in values if key in moved}
 
@@ -195,10 +195,10 @@ def execution(context: Context) -> CheckFinding:
                 low, high = min(moved[key]), max(moved[key])
                 bounds = getattr(named[key].execution, key[1], None)
                 was = getattr(named[key].base, key[1], None)
-                rows.append((task, rules, *key, _range(was), _range(bounds), f"{low:.3f} … {high:.3f}"))
-                if bounds is not None and not _fills(low, high, bounds):
+                rows.append((task, rules, *key, shown_range(was), shown_range(bounds), f"{low:.3f} … {high:.3f}"))
+                if bounds is not None and not fills(low, high, bounds):
                     broken.append(
-                        f"{where}: {' '.join(key)} is drawn from {low:.3f} to {high:.3f}, not {_range(bounds)}"
+                        f"{where}: {' '.join(key)} is drawn from {low:.3f} to {high:.3f}, not {shown_range(bounds)}"
                     )
     placed = [_reset_faults(context, task) for task in context.tasks]
     broken += [fault for faults in placed for fault in faults]
@@ -218,11 +218,12 @@ def execution(context: Context) -> CheckFinding:
     return CheckFinding("fail" if broken else "pass", summary, (sheet,), (*broken, *notes))
 
 
-def _range(bounds: tuple[float, float] | None) -> str:
+def shown_range(bounds: tuple[float, float] | None) -> str:
+    """A range in words; a dash for none."""
     return "-" if bounds is None else f"{bounds[0]:.3f} … {bounds[1]:.3f}"
 
 
-def _fills(low: float, high: float, bounds: tuple[float, float]) -> bool:
+def fills(low: float, high: float, bounds: tuple[float, float]) -> bool:
     """True if draws lie in a range and span it."""
     least, most = min(bounds), max(bounds)
     return least <= low and high <= most and high - low >= FILLED * (most - least)
@@ -274,9 +275,9 @@ def dynamics(context: Context) -> CheckFinding:
     ranges, first = modes.get(name).dynamics, context.tasks[0]
     for key, bounds in ranges.items():
         drawn = [modes.get(name).draw(seed)[key] for seed in context.seeds(first, DRAWN_SEEDS)]
-        rows.append((key, modes.QUANTITIES[key].unit, _range(bounds), f"{min(drawn):.3f} … {max(drawn):.3f}"))
-        if not _fills(min(drawn), max(drawn), bounds):
-            broken.append(f"{key}: drawn from {min(drawn):.3f} to {max(drawn):.3f}, not {_range(bounds)}")
+        rows.append((key, modes.QUANTITIES[key].unit, shown_range(bounds), f"{min(drawn):.3f} … {max(drawn):.3f}"))
+        if not fills(min(drawn), max(drawn), bounds):
+            broken.append(f"{key}: drawn from {min(drawn):.3f} to {max(drawn):.3f}, not {shown_range(bounds)}")
     for task in context.tasks:
         spec, rule_set = tasks.get(task), rule_sets.get("paper")
         for seed in context.seeds(task, DRAWN_SEEDS):
@@ -284,7 +285,7 @@ def dynamics(context: Context) -> CheckFinding:
             if (base.placed, base.light) != (other.placed, other.light):
                 broken.append(f"{task}: episode seed {seed} has other placements or lights than in base mode")
                 break
-        measure = functools.partial(_stand, context, task, context.trackers[0])
+        measure = functools.partial(stand, context, task, context.trackers[0])
         found = context.measured(name, task, context.trackers[0], {}, measure)
         assert isinstance(found, list)
         broken += [f"{task}: {fault}" for fault in found]
@@ -295,15 +296,24 @@ def dynamics(context: Context) -> CheckFinding:
     )
 
 
-def _stand(context: Context, task: str, tracker: str) -> list[str]:
-    """Faults of an episode in which the robot stands: in base mode, with usual values, with each quantity alone."""
-    ranges = modes.get(modes.DYNAMICS).dynamics
-    alone = [key for key in ranges if key not in ("push_heading", "push_time")]
+def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS) -> list[str]:
+    """Faults of an episode in which the robot stands: in base mode, with usual values, with each quantity alone.
+
+    Args:
+        context: What is certified.
+        task: Task name.
+        tracker: Tracker with the weights it comes with.
+        mode: Mode whose ranges are tried at their ends, of the two the one further from the usual value.
+    """
+    usual = {key: quantity.usual for key, quantity in modes.QUANTITIES.items()}
+    ends = {key: max(bounds, key=lambda end: abs(end - usual[key])) for key, bounds in modes.get(mode).dynamics.items()}
+    alone = [key for key, end in ends.items() if end != usual[key] and key not in ("push_heading", "push_time")]
+    if not alone:
+        return []
     env = world_of(context, task, tracker, worlds=2 + len(alone))
     drawn = tasks.get(task).drawn(context.seeds(task, 1)[0], "base", rule_sets.get("paper").task(task))
-    usual = {key: quantity.usual for key, quantity in modes.QUANTITIES.items()}
     usual["push_time"] = PUSHED_AT / env.budget
-    given = [{}, usual, *({**usual, key: ranges[key][1]} for key in alone)]
+    given = [{}, usual, *({**usual, key: ends[key]} for key in alone)]
     faults: list[str] = []
     built = env.physics.models[0]
     seeds = context.seeds(task, 1) * env.worlds

@@ -8,12 +8,14 @@ from types import SimpleNamespace
 import pytest
 from eval_fakes import FakeEnv, factories, last_tick
 
+from arena_newton import recorders
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.records.journal import EpisodeRecord
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.eval.workers.worker_pool import WorkerPool
 from arena_newton.interfaces import Recorder
+from arena_newton.recorders import Metric
 
 RUN = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
 
@@ -54,6 +56,18 @@ def test_a_metric_is_in_the_journal_and_in_every_table(measured, tmp_path, capsy
     assert "contradictions 0" in capsys.readouterr().out
 
 
+def package(folder, monkeypatch):
+    """Leaves a package with the recorder `ticks` where Python finds it, as an installer does."""
+    text = "    name = 'ticks'\n    fold = 'last'\n    def measure(self, env):\n        return env.tick\n"
+    (folder / "of_ticks.py").write_text(f"from arena_newton.recorders import Metric\nclass Ticks(Metric):\n{text}")
+    (folder / "of_ticks-1.dist-info").mkdir()
+    (folder / "of_ticks-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: of-ticks\nVersion: 1\n")
+    (folder / "of_ticks-1.dist-info" / "entry_points.txt").write_text(
+        "[arena_newton.recorders]\nticks = of_ticks:Ticks\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+
+
 def same_metrics(folder, measured):
     """The metrics of a folder are those of another."""
     assert (folder / "results.json").read_text().count("last_tick") == 2
@@ -71,10 +85,25 @@ def test_joined_shards_keep_metrics(measured, tmp_path):
 
 
 @pytest.mark.release
-def test_other_processes_give_the_same_metrics(measured, tmp_path):
-    """Two processes measure as one does."""
-    assert main([*RUN, "--jobs", "2", "--out", str(tmp_path / "jobs")], factories(recorders=last_tick)) == 0
-    same_metrics(tmp_path / "jobs", measured)
+def test_other_processes_give_the_same_metrics(measured, tmp_path, monkeypatch):
+    """Two processes measure as one does, also by the recorder of a package."""
+    package(tmp_path, monkeypatch)
+    flags = ["--recorder", "ticks", "--jobs", "2", "--out", str(tmp_path / "jobs")]
+    assert main([*RUN, *flags], factories(recorders=last_tick)) == 0
+    lines = journal(tmp_path / "jobs")
+    assert all(lines[i]["extra"].pop("ticks") == line["steps"] for i, line in lines.items())
+    assert {i: line["extra"] or None for i, line in lines.items()} == {
+        i: line.get("extra") for i, line in journal(measured).items()
+    }
+
+
+def test_a_name_that_other_processes_lack_is_explained():
+    """A recorder that a program registers is refused where others play, with what to do."""
+    pool, job = object.__new__(WorkerPool), SimpleNamespace(opened=None)
+    pool.backend, pool.workers = SimpleNamespace(flag="--jobs 2"), []
+    pool.messages = lambda: [(job, None, InputError("--recorder own: unknown recorder; known are speed"))]
+    with pytest.raises(InputError, match="--recorder own: unknown there: this program offers it .* as an entry point"):
+        pool.opened(job)
 
 
 def given(name, value):
@@ -103,6 +132,27 @@ def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
     said = capsys.readouterr().err
     assert f"error: recorder: metric {says}".replace("  ", " ") in said.replace("  ", " ")
     assert "expected a finite number with a name" in said and journal(tmp_path / "a") == {}
+
+
+def test_metrics_of_one_name_are_refused(tmp_path, capsys):
+    """Two metrics of one name, of which a line could hold one, are an error that names both; so is one given twice."""
+
+    class Ticks(Metric):
+        name = "ticks"
+
+    class Hops(Metric):
+        name = "ticks"
+
+    assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=lambda env: [Ticks(env), Hops(env)])) == 2
+    said = capsys.readouterr().err
+    assert "error: metric ticks: is the name of" in said and "<locals>.Ticks and of" in said and "<locals>.Hops" in said
+    assert journal(tmp_path / "a") == {}
+    recorders.register("ticks", Ticks)
+    try:
+        assert main([*RUN, "--recorder", "ticks", "ticks", "--out", str(tmp_path / "b")]) == 2
+        assert "error: --recorder ticks: given twice" in capsys.readouterr().err
+    finally:
+        recorders.unregister("ticks")
 
 
 def test_a_metric_of_any_size_has_its_figures(tmp_path):

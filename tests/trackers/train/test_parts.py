@@ -256,6 +256,8 @@ def test_events_are_options():
     ):
         with pytest.raises(InputError, match=words):
             events.configured([change])
+    with pytest.raises(InputError, match="--events push planar: given twice"):
+        events.configured([("push", "planar", 1.0), ("push", "turn", 1.0), ("push", "planar", 2.0)])
 
 
 def test_late_signals_are_what_the_tracker_lives_with(library):

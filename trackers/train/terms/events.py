@@ -228,7 +228,7 @@ def configured(changes: Sequence[tuple[str, str, float]]) -> dict[str, Event]:
     """`EVENTS` with other settings, given as event, setting and value.
 
     Raises:
-        InputError: An event or a setting is unknown, or a value unfit for it.
+        InputError: An event or a setting is unknown, a setting is given twice, or a value is unfit for it.
     """
     events = dict(EVENTS)
     for name, key, value in changes:
@@ -238,6 +238,8 @@ def configured(changes: Sequence[tuple[str, str, float]]) -> dict[str, Event]:
         if key not in settings:
             raise InputError(f"--events {name} {key}: no such setting; {name} has {', '.join(settings)}")
         flag = f"--events {name} {key}"
+        if [change[:2] for change in changes].count((name, key)) > 1:
+            raise InputError(f"{flag}: given twice")
         check_number(flag, value, *BOUNDS.get(key, (0.0, 1e3)))
         if key == "ticks" and not float(value).is_integer():
             raise InputError(f"{flag} {value}: expected a whole number")
