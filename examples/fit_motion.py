@@ -35,12 +35,14 @@ def main() -> None:
     parser.add_argument("--plays", type=int, default=32, help="plays of a generation of CEM")
     parser.add_argument("--max-steps", type=int, default=50, help="ticks of 0.02 s")
     parser.add_argument("--seed", type=int, default=3, help="of the other robot and of CEM")
-    args, twist2 = parser.parse_args(), trackers.get("twist2")
+    args = parser.parse_args()
     torch.manual_seed(args.seed)
     real = torch.tensor([1.2, 0.8]).double() + torch.rand(2).double() * torch.tensor(
         [0.4, 0.1]
     )  # torso's mass, stiffness
-    one, many = (ArenaEnv("football", tracker=twist2, worlds=n, rules="released") for n in (1, args.plays))
+    one, many = (
+        ArenaEnv("football", tracker=trackers.get("twist2"), worlds=n, rules="released") for n in (1, args.plays)
+    )
     moves = torch.zeros(1, KNOTS, 32, dtype=torch.float64, requires_grad=True)
     wanted = played(one, moves.detach(), args, torch.ones(2).double())
 

@@ -26,8 +26,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("slopes.png"), help="the picture")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    track = trackers.get("twist2")
-    one, many = (ArenaEnv("football", tracker=track, worlds=n, fast_physics=True) for n in (1, args.points))
+    one, many = (
+        ArenaEnv("football", tracker=trackers.get("twist2"), worlds=n, fast_physics=True) for n in (1, args.points)
+    )
     with torch.no_grad():
         plan = differentiable.closed_loop(one, policies.get("expert"), [SEED], args.max_steps).actions.transpose(0, 1)
     ball, root = one.scene.joint_qpos(BALL), one.scene.robot.root_qpos

@@ -96,7 +96,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
         tasks=tuple(dict.fromkeys(chosen)),
         command=options.command or training_command(facts) or (before.command if before is not None else ""),
         looks=changed_looks(facts) or (before.looks if before is not None else ()),
-        trained_weights=before.trained_weights if before is not None else "",
+        trained_weights=before.trained_weights if before is not None else checkpoint.digest,
         packed_by="; then ".join([*([before.packed_by] if before and kept else []), packed_by]),
         note=options.note or (before.note if before is not None else ""),
         results=_in_order(found, chosen, facts.trackers),

@@ -110,7 +110,6 @@ def pack(folder: Path, out: Path, card: PolicyCard) -> PolicyCard:
     card = dataclasses.replace(
         card,
         weights=_digest(weights),
-        trained_weights=card.trained_weights or checkpoint.digest,
         bytes=sum(map(len, files.values())),
         **training_entries(facts),  # type: ignore[arg-type]  # each is of its field's kind
     )
