@@ -67,7 +67,7 @@ def check(m: mujoco.MjModel) -> None:
         "an integrator other than implicitfast": m.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
         "a tendon": m.ntendon > 0,
         "an activation state": m.na > 0,
-        f"actuator {int(foreign.argmax())}, not a joint's position drive": foreign.any(),
+        f"actuator {[*foreign, True].index(True)}, not a joint's position drive": foreign.any(),
         "a delayed actuator": m.nhistory > 0,
         "a deformable body": m.nflex > 0,
         "a plugin": m.nplugin > 0,
@@ -162,11 +162,11 @@ class ImplicitWorld:
             if kind in turning
         ]
         self._alone = [
-            (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_bodyid[j]))
+            (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), np.flatnonzero(model.body_treeid == tree).tolist())
             for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-            if (model.body_treeid == model.body_treeid[model.jnt_bodyid[j]]).sum() == 1
+            if model.tree_dofnum[tree := model.body_treeid[model.jnt_bodyid[j]]] == 6
         ]
-        """Address of position, of velocity, and body of each body that is a tree by itself."""
+        """Address of position, of velocity, and rigid bodies of each free joint that is its tree's only one."""
         self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
         self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
         self._mass_at = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
@@ -360,12 +360,10 @@ class ImplicitWorld:
         ω × I ω as a torque about the centre.
         """
         m, at_q, at_v = self._inverse, np.zeros_like(y), np.zeros_like(y)
-        total, axes, frame = np.zeros(len(y)), np.empty(9), np.empty(9)
-        for qpos, dof, body in self._alone:
+        total, frame = np.zeros(len(y)), np.empty(9)
+        for qpos, dof, bodies in self._alone:
             mujoco.mju_quat2Mat(frame, step.q[qpos + 3 : qpos + 7])
-            mujoco.mju_quat2Mat(axes, m.body_iquat[body])
-            main = axes.reshape(3, 3)
-            inertia, r, mass = main @ np.diag(m.body_inertia[body]) @ main.T, m.body_ipos[body], m.body_mass[body]
+            mass, r, inertia = _lump(m, bodies)
             turn = slice(dof + 3, dof + 6)
             spin, c, z = step.v[turn], step.change[turn], y[:, turn]
             pull = y[:, dof : dof + 3] @ frame.reshape(3, 3)
@@ -469,3 +467,21 @@ def _solved(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
     for solution, row in zip(found, rows, strict=True):
         mujoco.mju_cholSolve(solution, matrix, row)
     return found
+
+
+def _lump(m: mujoco.MjModel, bodies: Sequence[int]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre and inertia about it of rigidly joined bodies, parents first, in the frame of the first one."""
+    poses, parts, turn, axes = {bodies[0]: (np.zeros(3), np.eye(3))}, [], np.empty(9), np.empty(9)
+    for body in bodies:
+        if body != bodies[0]:
+            mujoco.mju_quat2Mat(turn, m.body_quat[body])
+            at, frame = poses[int(m.body_parentid[body])]
+            poses[body] = at + frame @ m.body_pos[body], frame @ turn.reshape(3, 3)
+        at, frame = poses[body]
+        mujoco.mju_quat2Mat(axes, m.body_iquat[body])
+        main = frame @ axes.reshape(3, 3)
+        parts.append((m.body_mass[body], at + frame @ m.body_ipos[body], main @ np.diag(m.body_inertia[body]) @ main.T))
+    mass = sum(part for part, *_ in parts)
+    centre = sum(part * at for part, at, _ in parts) / mass
+    arms = [(part, at - centre, own) for part, at, own in parts]
+    return mass, centre, sum(own + part * (s @ s * np.eye(3) - np.outer(s, s)) for part, s, own in arms)

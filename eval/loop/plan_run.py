@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from arena_newton.errors import InputError
 from arena_newton.eval.loop.plan_commands import ALL_GPUS, STAGES, PlanCommand
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.own_processes import end, environment, how_it_ended, start_module
@@ -105,7 +106,6 @@ class CommandPlayer:
         """Play what is not done; False if a command failed, after all that do not need it.
 
         Raises:
-            InputError: A command cannot begin.
             KeyboardInterrupt: Ctrl-C or SIGTERM; running commands kept what they had.
         """
         (self.out / "logs").mkdir(exist_ok=True)
@@ -126,7 +126,11 @@ class CommandPlayer:
                 for command in sorted(filter(ready, waiting), key=lambda one: -one.size):
                     if self._has_room(command):
                         waiting.remove(command)
-                        self._begin(command)
+                        try:
+                            self._begin(command)
+                        except InputError as error:  # others go on: one whole training is enough to play
+                            self.failed[str(command)] = str(error)
+                            print(f"[{command}] failed: {error}", flush=True)
                 time.sleep(POLL)
                 for one in self._ended():
                     if self._ended_well(one):

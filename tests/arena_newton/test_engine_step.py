@@ -10,7 +10,7 @@ import torch
 
 from arena_newton import tasks
 from arena_newton.differentiable import EngineState, EngineStep
-from arena_newton.differentiable.implicit import check
+from arena_newton.differentiable.implicit import ImplicitWorld, Inputs, check
 from arena_newton.errors import InputError
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
@@ -122,6 +122,30 @@ def test_the_mass_of_what_spins_does_not_matter():
     (gradient,) = torch.autograd.grad(after.sum(), factor)
     assert (after - begin.qvel[0, speed : speed + 6])[3:].abs().max() > 1e-3  # the axis turns
     assert abs(float(gradient)) < 1e-8
+
+
+def test_a_rigid_part_joined_to_what_spins_has_the_slopes_of_differences():
+    """The engine integrates a free joint that is its tree's only one with -dC/dv, however many bodies it carries."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option integrator="implicitfast" timestep="0.005"/><worldbody><body pos="0 0 2"><freejoint/>'
+        '<geom type="box" size=".05 .1 .2" pos=".02 .03 -.04" euler="20 30 40"/>'
+        '<body pos=".3 0 .1" euler="10 20 30"><geom type="box" size=".1 .05 .04"/></body></body></worldbody></mujoco>'
+    )
+    check(model)
+    data, spin = mujoco.MjData(model), np.array([0.0, 0.0, 0.0, 7.0, -5.0, 9.0])
+    carried = np.empty(mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
+    mujoco.mj_getState(model, data, carried, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+    world = ImplicitWorld(model, SimpleNamespace(latch=None), 1, [])
+    slopes = world.jacobian(Inputs(data.qpos.copy(), spin, carried, np.zeros(0), np.zeros(0)))[0]
+
+    def after(move):
+        one = mujoco.MjData(model)
+        one.qvel[:] = spin + move
+        mujoco.mj_step(model, one)
+        return one.qvel
+
+    found = np.stack([(after(move) - after(-move)) / 2e-6 for move in 1e-6 * np.eye(6)], axis=1)
+    np.testing.assert_allclose(slopes[6:, 6:], found, atol=1e-6)
 
 
 def test_friction_moves_a_ball_that_hops_on_the_grass():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from arena_newton.errors import InputError
 from arena_newton.eval.loop.plan_commands import ALL_GPUS, PlanCommand
 from arena_newton.eval.loop.plan_run import CommandPlayer, CommandTime, command_times, stage_seconds
 from arena_newton.files.new_folder import held_folder
@@ -157,3 +158,15 @@ def test_a_line_that_a_kill_cut_is_left_out(tmp_path):
     line = '{"stage": "record", "name": "a", "began": 1.0, "ended": 2.0, "code": 0}\n'
     (tmp_path / "commands.jsonl").write_text(line + '{"stage": "rec\n[1]\n{"stage": "x"}\n' + line)
     assert [one.name for one in command_times(tmp_path)] == ["a", "a"]
+
+
+def test_a_command_that_cannot_begin_ends_no_other(tmp_path):
+    """What needs one of several trainings is played although the time of another is over."""
+
+    def over():
+        raise InputError("nothing is left to train in")
+
+    late = dataclasses.replace(command("train", "b", "go", tmp_path / "b"), words=over)
+    plays = command("evaluate", "all", "go", tmp_path / "c", ("train a", "train b"), needs_all=False)
+    player = played(tmp_path / "out", [command("train", "a", "go", tmp_path / "a"), late, plays], train=2)
+    assert player.failed == {"train b": "nothing is left to train in"} and (tmp_path / "c").exists()
