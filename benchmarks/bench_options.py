@@ -255,4 +255,4 @@ class GradientBenchOptions(PlainBenchOptions):
     episodes: int = field(default=1, metadata=bounds(1, 1000))
     """Episodes of each task that are replayed."""
     step: float = 1e-6
-    """Step of the differences of a closed loop."""
+    """Step of the differences of a tick or a closed loop."""

@@ -19,7 +19,7 @@ from arena_newton.differentiable import Rolled, closed_loop, reach, reset_state,
 from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.timing import BenchFigure, Figures, chosen
-from arena_newton.eval.certification.checks.gradients import TICK_STEPS, Slopes, TickSlopes
+from arena_newton.eval.certification.checks.gradients import Slopes, TickSlopes
 from arena_newton.interfaces import Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
@@ -72,7 +72,9 @@ def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
     """Figures that `--what` names, by tracker and task; differences are those of a converged solver."""
     every = options.tasks or tasks.names()
     items: dict[str, Figures] = {
-        "ticks": lambda: (_tick(task, tracker, options.states) for tracker in options.trackers for task in every),
+        "ticks": lambda: (
+            _tick(task, tracker, options.states, options.step) for tracker in options.trackers for task in every
+        ),
         "loops": lambda: (
             _loop(task, tracker, ticks, bar, factors, options.step)
             for tracker in options.trackers
@@ -107,11 +109,11 @@ def _world(task: str, tracker: str) -> ArenaEnv:
     return ArenaEnv(task, tracker=follows, worlds=1, engine="mujoco", rules="released", fast_physics=True)
 
 
-def _tick(task: str, tracker: str, states: int) -> BenchFigure:
+def _tick(task: str, tracker: str, states: int, step: float) -> BenchFigure:
     worlds = -(-states // LOOKS)
     gym_id = tasks.get(task).gym_id
     episodes = [SimpleNamespace(episode_seed=seeding.episode_seed(gym_id, 0, repeat)) for repeat in range(worlds)]
-    looks = [TickSlopes(EVERY, steps) for steps in (torch.eye(len(PARTS)) * torch.tensor(TICK_STEPS)).tolist()]
+    looks = [TickSlopes(EVERY, steps) for steps in (step * torch.eye(len(PARTS), dtype=torch.float64)).tolist()]
     env = ArenaEnv(task, tracker=trackers.get(tracker), worlds=worlds, engine="mujoco", fast_physics=True)
     try:
         Rollout(env, policies.get("expert"), episodes, recorder=looks, max_steps=EVERY * LOOKS).run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -68,8 +69,9 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         raise InputError(f"--replay {options.replay}: expected a number of episodes")
     if options.fresh < 0:
         raise InputError(f"--fresh {options.fresh}: expected a number of episodes")
-    if not options.tolerance >= 0:
-        raise InputError(f"--tolerance {options.tolerance:g}: expected at least 0")
+    for name in ("tolerance", "tick_tolerance", "velocity_tolerance"):
+        if not 0 <= (value := getattr(options, name)) < math.inf:  # nothing contradicts a tolerance that is no number
+            raise InputError(f"--{name.replace('_', '-')} {value:g}: expected a finite number of at least 0")
     if options.policy is not None and not (options.replay or options.all or options.fresh):
         raise InputError("--policy: asks at the queries of --replay or --all, or plays --fresh episodes; add one")
     if options.policy is None and (options.fresh or options.tolerance):

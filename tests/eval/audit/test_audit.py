@@ -307,7 +307,11 @@ def test_a_rate_that_new_seeds_do_not_have_is_found(honest, capsys):
 
 
 @pytest.mark.parametrize(
-    "flags", [("--policy", "stand"), ("--fresh", "3"), ("--tolerance", "-1"), ("--replay", "-1"), ("--fresh", "-1")]
+    "flags",
+    [
+        *[("--policy", "stand"), ("--fresh", "3"), ("--tolerance", "-1"), ("--replay", "-1"), ("--fresh", "-1")],
+        *[("--tolerance", "inf"), ("--tick-tolerance", "nan"), ("--velocity-tolerance", "-1")],
+    ],
 )
 def test_flags_that_do_nothing_are_refused(honest, capsys, flags):
     """A flag that lacks its other one, or is out of range, is a line and code 2."""
