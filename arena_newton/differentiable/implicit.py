@@ -167,6 +167,8 @@ class ImplicitWorld:
             if model.tree_dofnum[tree := model.body_treeid[model.jnt_bodyid[j]]] == 6
         ]
         """Address of position, of velocity, and rigid bodies of each free joint that is its tree's only one."""
+        self._turns = np.array([[dof + 3, dof + 4, dof + 5] for _, dof, _ in self._alone], int).reshape(-1, 3)
+        self._lumped: tuple[bytes, np.ndarray, np.ndarray, np.ndarray] | None = None
         self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
         self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
         self._mass_at = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
@@ -359,22 +361,33 @@ class ImplicitWorld:
         Of such a body's centre at r, mass m and inertia I in its frame Q, C is m ω × (ω × r) as a force, in Q, and
         ω × I ω as a torque about the centre.
         """
-        m, at_q, at_v = self._inverse, np.zeros_like(y), np.zeros_like(y)
-        total, frame = np.zeros(len(y)), np.empty(9)
-        for qpos, dof, bodies in self._alone:
+        at_q, at_v = np.zeros_like(y), np.zeros_like(y)
+        if not self._alone:
+            return np.zeros(len(y)), at_q, at_v
+        mass, r, inertia = self._lumps()
+        frames = np.empty((len(self._alone), 9))
+        for frame, (qpos, *_) in zip(frames, self._alone, strict=True):
             mujoco.mju_quat2Mat(frame, step.q[qpos + 3 : qpos + 7])
-            mass, r, inertia = _lump(m, bodies)
-            turn = slice(dof + 3, dof + 6)
-            spin, c, z = step.v[turn], step.change[turn], y[:, turn]
-            pull = y[:, dof : dof + 3] @ frame.reshape(3, 3)
-            p = pull + _cross(z, r)
-            force = mass * (_cross(c, _cross(spin, r)) + _cross(spin, _cross(c, r)))
-            by_spin = mass * (_cross(r, _cross(p, c)) + _cross(_cross(c, r), p))
-            by_spin += _cross(z, c) @ inertia + _cross(inertia @ c, z)
-            total -= by_spin @ spin
-            at_v[:, turn] = -by_spin
-            at_q[:, turn] = -_cross(force, pull)
-        return total, at_q, at_v
+        turns = self._turns
+        spin, c, z = step.v[turns][:, None], step.change[turns][:, None], y.T[turns].transpose(0, 2, 1)
+        pull = y.T[turns - 3].transpose(0, 2, 1) @ frames.reshape(-1, 3, 3)
+        p = pull + _cross(z, r)
+        force = mass * (_cross(c, _cross(spin, r)) + _cross(spin, _cross(c, r)))
+        by_spin = mass * (_cross(r, _cross(p, c)) + _cross(_cross(c, r), p))
+        by_spin += _cross(z, c) @ inertia + _cross(c @ inertia, z)
+        at_v[:, turns] = -by_spin.transpose(1, 0, 2)
+        at_q[:, turns] = -_cross(force, pull).transpose(1, 0, 2)
+        return -(by_spin * spin).sum(axis=(0, 2)), at_q, at_v
+
+    def _lumps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mass, centre and inertia of the bodies that move freely, shapes [n, 1, 1], [n, 1, 3] and [n, 3, 3]."""
+        m = self._inverse
+        key = m.body_mass.tobytes() + m.body_inertia.tobytes()
+        if self._lumped is None or self._lumped[0] != key:
+            found = zip(*(_lump(m, bodies) for *_, bodies in self._alone), strict=True)
+            mass, centre, inertia = map(np.array, found)
+            self._lumped = key, mass[:, None, None], centre[:, None], inertia
+        return self._lumped[1:]
 
     def _jacobian(self) -> np.ndarray:
         """Jacobian of the constraints, shape [constraints, nv]."""
@@ -488,6 +501,6 @@ def _lump(m: mujoco.MjModel, bodies: Sequence[int]) -> tuple[float, np.ndarray, 
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of vectors or rows of them, in half of `np.cross`'s time, bit for bit."""
-    (a0, a1, a2), (b0, b1, b2) = a.T, b.T
+    """Cross products over the last dimension, in half of `np.cross`'s time."""
+    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
