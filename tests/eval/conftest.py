@@ -134,3 +134,18 @@ def push_bin():
     tasks.register(dataclasses.replace(like, name="push_bin", scene=like.layer, interaction=carried))
     yield "push_bin"
     tasks.unregister("push_bin")
+
+
+@pytest.fixture
+def damped(monkeypatch):
+    """Plants a fault: drawn dynamics damp all joints as well."""
+    from arena_newton.physics import batch
+
+    honest = batch.varied
+
+    def varied(model, robot, sample):
+        own = honest(model, robot, sample)
+        own.dof_damping[:] += 0.1
+        return own
+
+    return lambda: monkeypatch.setattr(batch, "varied", varied)

@@ -173,7 +173,7 @@ def test_a_damaged_folder_is_named(folder, capsys, damage, code, named):
 
 
 def test_bytes_that_are_no_line_are_said(folder, capsys):
-    """What a kill left behind the last whole line of a journal is not read, and an audit says so."""
+    """Bytes that a kill left behind the last whole line of a journal are not read, and an audit says so."""
     with (folder / "episodes.jsonl").open("ab") as journal:
         journal.write(b"[1, 2]\n")
     assert main(["audit", str(folder)]) == 0

@@ -18,7 +18,6 @@ from arena_newton.eval.certification.finding import Score, discordant
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, GLIDE_HEIGHT, HeldLegs, freeze_legs
 from arena_newton.eval.play.factories import Factories
 from arena_newton.pages.tables import Table
-from arena_newton.physics import batch
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, DEFAULT_POSE, LEGS, TICK
@@ -196,18 +195,11 @@ def test_a_mode_that_moves_more_is_found(tmp_path, monkeypatch):
     assert "z is drawn from 1." in text
 
 
-def test_dynamics_that_change_more_are_found(tmp_path, monkeypatch):
+def test_dynamics_that_change_more_are_found(tmp_path, damped):
     """The mode passes its check; one that also damps the joints fails it, by the field and by the bits of base mode."""
     options = CertifyOptions(out=str(tmp_path / "honest"), task=("boxing",), checks=("dynamics",), quick=True)
     assert certify.run(options) == 0
-    honest = batch.varied
-
-    def damped(model, robot, sample):
-        own = honest(model, robot, sample)
-        own.dof_damping[:] += 0.1
-        return own
-
-    monkeypatch.setattr(batch, "varied", damped)
+    damped()
     assert certify.run(dataclasses.replace(options, out=str(tmp_path / "damped"))) == 1
     text = "".join(page.read_text() for page in (tmp_path / "damped").glob("certify*.md")).replace("\\_", "_")
     assert "boxing: dof_damping is not as drawn" in text and "usual values differ from base mode from tick" in text

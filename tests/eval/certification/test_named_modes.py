@@ -9,7 +9,6 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.named_modes import drawn
-from arena_newton.physics import batch
 from arena_newton.rules import modes, seeding
 from arena_newton.rules.modes import Mode
 from arena_newton.rules.rule_types import PoseRange
@@ -51,16 +50,9 @@ def test_a_mode_moves_what_its_record_says(tmp_path, offered, capsys):
     assert f"dim moves {numbers}, a drawn light; nothing else" in said
 
 
-def test_what_changes_more_than_its_record_says_is_found(tmp_path, offered, monkeypatch):
+def test_what_changes_more_than_its_record_says_is_found(tmp_path, offered, damped):
     """Damping beside the friction that is drawn is found by the field that differs, and by the bits of base mode."""
-    honest = batch.varied
-
-    def damped(model, robot, sample):
-        own = honest(model, robot, sample)
-        own.dof_damping[:] += 0.1
-        return own
-
-    monkeypatch.setattr(batch, "varied", damped)
+    damped()
     slick = offered(Mode(name="slick", sentence="slippery", dynamics={"friction": (0.2, 0.5)}))
     assert certify.run(options(tmp_path, checks=("modes",), mode=(slick,))) == 1
     text = "".join(page.read_text() for page in tmp_path.glob("certify*.md")).replace("\\_", "_")

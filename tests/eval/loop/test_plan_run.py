@@ -161,7 +161,7 @@ def test_a_line_that_a_kill_cut_is_left_out(tmp_path):
 
 
 def test_a_command_that_cannot_begin_ends_no_other(tmp_path):
-    """What needs one of several trainings is played although the time of another is over."""
+    """A command that needs one of several trainings is played although the time of another is over."""
 
     def over():
         raise InputError("nothing is left to train in")
