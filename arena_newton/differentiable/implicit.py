@@ -341,7 +341,7 @@ class ImplicitWorld:
         y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
         for _, dof, _ in self._alone:
             own = slice(dof, dof + 6)
-            y[:, own] = h * np.linalg.solve((mass - h * rates)[own, own].T, at_v[:, own].T).T
+            y[:, own] = h * np.linalg.solve((mass[own, own] - h * rates[own, own]).T, at_v[:, own].T).T
         w = _solved(mass + constrained, y @ mass)
         at_v = at_v - (stiffened * (w @ jacobian.T)) @ jacobian + w @ rates
         _, turned, spun = self._spinning(step, y)
