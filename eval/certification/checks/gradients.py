@@ -157,8 +157,8 @@ def gradients(context: Context) -> CheckFinding:
         "Estimates are central differences; those of the conversion are played through the closed loop.",
         "Where slopes within the step differ by more than that there is a kink, or too little slope for float32: "
         f"nothing is compared there, and {percent(1.0 - COMPARABLE, 0)} % of the slopes at most may be left out so.",
-        "The engine's solver stops at a tolerance, now and then on the other side of a constraint's edge than a converged "
-        "one, of which differences are taken; `tick, converged solver` is exact and estimated at the same point.",
+        "The engine's solver stops at a tolerance, now and then on the other side of a constraint's edge than a "
+        "converged one, whose differences these are; `tick, converged solver` compares it with itself.",
     )
     sheet = Table(head, rows, title="Exact slopes and central differences")
     return CheckFinding("fail" if wrong else "pass", summary, (sheet,), (*wrong, *notes))
