@@ -337,7 +337,6 @@ def flight_slopes(ball: RollingBall, device: torch.device) -> Slopes:
 
     Args:
         ball: What they are.
-        device: Where they fly.
     """
     draws = torch.Generator().manual_seed(SEED)
     angle = 2.0 * torch.pi * torch.rand(BALLS, generator=draws)
