@@ -114,11 +114,9 @@ def plan_commands(
 
     Args:
         plan: The plan.
-        folders: Where it is played.
         rows: Its rows that are trained.
         seeds: Seeds of the trainings of each row.
         device: Device of all commands; None: the best there is.
-        gpus: GPUs of this machine.
         minutes: Time of a training that begins now [min].
         middle: Seed of the training that is packed of those in some suites, and the suites that hold others.
     """

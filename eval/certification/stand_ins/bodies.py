@@ -78,7 +78,6 @@ def freeze_legs(env: World, action: torch.Tensor) -> torch.Tensor:
     tracker still balances. Waist, arms and hands are the policy's.
 
     Args:
-        env: The worlds.
         action: The policy's actions, shape [worlds, 40].
     """
     stand = torch.as_tensor(STAND_ACTION, dtype=action.dtype, device=action.device)
