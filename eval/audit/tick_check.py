@@ -61,7 +61,7 @@ def _largest(differences: list[np.ndarray], ticks: int) -> np.ndarray:
 
 
 def surface_radii(model: mujoco.MjModel) -> np.ndarray:
-    """Factors of degrees of freedom, shape [nv]: of a lone body's spin the distance of its farthest surface [m], else 1.
+    """Factors of degrees of freedom, shape [nv]: of a lone body's spin its farthest surface [m], else 1.
 
     A kick pinches the ball between foot and floor; engines agree on its speed then, and not on its spin.
     """
