@@ -34,8 +34,8 @@ JOINT_ERROR = 0.15
 WORST = 0.4
 """Largest mean error of one joint [rad]: no tracker of this package has half of it but at a wrist (measured)."""
 FOLLOWED = {"turn": 0.5, "walk": 0.75}
-"""Least part of a motion that is followed, the way it is commanded: official TWIST2 25k and 20k, `twist2` and `sonic`
-walk 0.84 to 0.94, with halved joints or swapped legs of the command or half the action scale 0.14 to 0.74 (measured)."""
+"""Least part of a motion that is followed, the way it is commanded. `twist2`, `sonic` and official TWIST2 20k and 25k
+walk 0.84 to 0.94; with a halved command, half the action scale or swapped legs at most 0.74 (measured)."""
 LEGLESS = 0.45
 """The same of a walk for a tracker that declares that it ignores the leg joints: FALCON walks 0.60 (measured)."""
 
