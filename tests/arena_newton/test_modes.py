@@ -18,6 +18,7 @@ from arena_newton.eval.records.identity import mode_facts
 from arena_newton.physics.dynamics import Delay
 from arena_newton.rules import modes
 from arena_newton.rules.modes import DYNAMICS, QUANTITIES, Mode
+from arena_newton.usd_scenes.preview import preview
 
 PAPER = rule_sets.get("paper")
 USUAL = {name: quantity.usual for name, quantity in QUANTITIES.items()}
@@ -56,7 +57,7 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
 
 
 def test_a_mode_of_another_package_brings_layers(monkeypatch, tmp_path):
-    """Its layer of a task opens in place of the scene and counts by content; a task without one refuses the mode."""
+    """Its layer opens in place of a task's scene, is previewed and counts by content; a task without one refuses it."""
     layer = tmp_path / "football.usda"
     head = (
         '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"\n'
@@ -69,6 +70,7 @@ def test_a_mode_of_another_package_brings_layers(monkeypatch, tmp_path):
     env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", threads=1, mode="night")
     assert env.scene.path == layer
     env.close()
+    assert preview(["football"], tmp_path / "night.png", 16, "night").is_file()
     before = mode_facts("night", PAPER, ("football",))
     layer.write_text(layer.read_text() + 'over "World"\n{\n}\n')
     after = mode_facts("night", PAPER, ("football",))

@@ -10,6 +10,8 @@ import warp as wp
 
 from arena_newton import rule_sets, tasks
 from arena_newton.robot import g1
+from arena_newton.tasks.handles import BodyFrame
+from arena_newton.tasks.judge import above, below
 from tests.scenes import scene
 
 
@@ -236,3 +238,11 @@ def test_conditions_must_match_the_predicates():
 
     with pytest.raises(InputError, match="predicates success: conditions are given for approach"):
         Judge(bench("boxing").scene, conditions={"approach": []})
+
+
+def test_above_and_below_meet():
+    """Everything is above or below a height: the two boxes share that face and reach beyond any scene."""
+    point = BodyFrame(1, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    (high,), (low,) = above(point, 0.3).boxes, below(point, 0.3).boxes
+    assert high.pos[2] - high.half[2] == pytest.approx(0.3) == low.pos[2] + low.half[2]
+    assert low.pos[2] - low.half[2] < -20.0 and high.pos[2] + high.half[2] > 20.0
