@@ -222,7 +222,6 @@ class TrackerLoop:
         `action_latency` ticks later; hands open and close at once.
 
         Args:
-            worlds: World indices.
             samples: Values of `modes.QUANTITIES`, one mapping per world.
         """
         if self._late is None:

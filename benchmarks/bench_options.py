@@ -214,8 +214,8 @@ class ProcessorOptions(PlainBenchOptions):
 class DeviceOptions(PlainBenchOptions):
     """Record experts on engine warp, and measure what an audit on engine mujoco allows for: ticks and pictures."""
 
-    device: Device[str] = "cpu"
-    """Device of engine warp: cuda:0, or cpu, which takes minutes."""
+    device: Device[str] | None = None
+    """Device of engine warp: the best there is when none is named; on the CPU it takes minutes."""
     tasks: Several[str] = ("football", "pp_box")
     """Tasks."""
     episodes: int = field(default=2, metadata=bounds(1, 10_000))

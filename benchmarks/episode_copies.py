@@ -23,7 +23,6 @@ def copy_episodes(episodes: Sequence[EpisodeFile], folder: Path, count: int) -> 
     Args:
         episodes: Recordings, at least one.
         folder: Empty folder.
-        count: Number of copies.
 
     Returns:
         NPZ files.

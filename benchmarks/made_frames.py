@@ -18,10 +18,7 @@ def made_frames(
     """Rows of noise, for measurements without a dataset.
 
     Args:
-        frames: Number of rows.
         size: Height and width of a picture [px]; an eighth of the rows above and below is black, as in a padded one.
-        device: Where they are wanted.
-        seed: Of the noise.
         length: Rows of an episode.
         network: Memory that the network needs beside them [bytes].
 

@@ -42,7 +42,6 @@ def motion_arrays(
         root_pos: Pelvis [m], shape [frames, 3].
         root_quat: Its orientation, wxyz, shape [frames, 4].
         joint_pos: Joints [rad], MuJoCo order, shape [frames, 29].
-        fps: Frames per second.
     """
     model = get_g1_robot_cfg().spec_fn().compile()
     data = mujoco.MjData(model)
@@ -73,7 +72,6 @@ def main(motion: str, worlds: int, device: str) -> None:
 
     Args:
         motion: NPZ with root_pos, root_quat, joint_pos and fps.
-        worlds: Parallel environments.
         device: cpu or cuda:0.
     """
     # What libraries print must not be taken for an answer.

@@ -54,11 +54,8 @@ class Pair:
         """The median of the rounds' ratios, which is not the ratio of the medians; a line of the history is added.
 
         Args:
-            options: Flags.
-            label: Name of the figure.
             rounds: Ours and the peer's of each round.
             unjudged: Why the bar is not judged; it is judged where this is empty.
-            notes: Further notes.
             device: Device; the GPU, or the processor where there is none, by default.
             peer_versions: Versions of a peer that has an interpreter of its own.
         """

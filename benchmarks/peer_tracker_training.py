@@ -49,7 +49,6 @@ class MjlabTraining:
         Args:
             python: The interpreter.
             motion: NPZ with root_pos, root_quat, joint_pos and fps.
-            worlds: Parallel environments.
             device: cpu or cuda:0.
             folder: What it prints besides its answers is kept here until it ends.
 
@@ -137,7 +136,6 @@ class OwnTraining:
 
         Args:
             library: The motions, NPZ.
-            worlds: Parallel worlds.
             device: cpu or cuda:0.
         """
         # Here, because the training's libraries are an extra.

@@ -82,8 +82,6 @@ def measure(options: TrainingBenchOptions, count: int, *, lerobot: bool = False)
     """Figures of so many trainings, each in a process of its own, that begin together.
 
     Args:
-        options: Flags.
-        count: Number of trainings.
         lerobot: LeRobot's own loop instead of ours.
 
     Raises:

@@ -104,8 +104,6 @@ class ReferencePose:
         """Allocates zeros for `worlds` worlds; reset it before the first step.
 
         Args:
-            worlds: Number of worlds.
-            device: Warp device.
             canonical_to_mujoco: MuJoCo index of each of the 29 canonical joints (`g1.CANONICAL_TO_MUJOCO`).
             tick: Control period [s] (`g1.TICK`).
             requires_grad: whether a `wp.Tape` differentiates through the arrays.

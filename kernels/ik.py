@@ -536,7 +536,6 @@ def launch_ik(model: Model, goal: wp.array, mask: wp.array, state: IkState) -> N
     """Solves one tick.
 
     Args:
-        model: Links.
         goal: Rows laid out as `GOAL`, shape [worlds, `GOAL_WIDTH`].
         mask: 1 = solve this world, int32, shape [worlds].
         state: Start and result.

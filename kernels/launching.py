@@ -78,8 +78,6 @@ def record(launcher: Callable[..., None], *args: Any, **kwargs: Any) -> Recorded
 
     Args:
         launcher: A function that only launches, such as `kernels.tick.launch_status`, and always the same kernels.
-        *args: Its arguments.
-        **kwargs: Its arguments.
     """
     before, _recording.into = _recording.into, Recorded()
     try:

@@ -25,7 +25,6 @@ def read_by(policy: Policy, labels: str, late: int = 0) -> Policy:
 
     Args:
         policy: Whose actions are of `labels`.
-        labels: Name of the protocol.
         late: Ticks from a query to the first action of its chunk, as `rollout.Rollout` delays them.
 
     Returns:
@@ -60,7 +59,6 @@ class V4Policy(Policy):
         """Take the policy whose actions are of v4.
 
         Args:
-            policy: The policy.
             late: Ticks from a query to the first action of its chunk.
         """
         self.policy, self._late = policy, late

@@ -45,7 +45,6 @@ def scene_stage(folder: Path, spawn: Vec, facing: Vec, *, eye: Vec, gaze: Vec, v
     """A layer `scene.usda` with physics, robot, world camera, dome light and variants.
 
     Args:
-        folder: Where it is written.
         spawn: Robot position [m].
         facing: Robot orientation, wxyz.
         eye: Position of the world camera [m].

@@ -38,7 +38,6 @@ def open_stage(path: str | Path, *, checked: bool = True) -> Usd.Stage:
     """Open a stage, the project's or a user's.
 
     Args:
-        path: A USD layer.
         checked: Check its files first; only the project's own may do without.
 
     Raises:

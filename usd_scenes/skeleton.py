@@ -37,7 +37,6 @@ def write(task: str, path: str | Path) -> Path:
     """Write a variant that validates, runs and changes nothing.
 
     Args:
-        task: Name of a task.
         path: The `.usda` file; one that exists stays as it is.
 
     Returns:

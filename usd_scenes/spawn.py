@@ -25,7 +25,6 @@ def penetrations(path: str | Path, task: str) -> tuple[list[Problem], list[Probl
 
     Args:
         path: A layer that passes `validate`.
-        task: Its task.
 
     Returns:
         Pairs that the layer brings, and pairs that start so in the task's own scene too: some of the original's ranges

@@ -46,7 +46,6 @@ def validate(path: str | Path, task: str | None = None) -> list[Problem]:
     """All faults of the layer at `path` as a scene of `task`.
 
     Args:
-        path: A USD layer.
         task: Task name; by default the task whose folder the layer, or a layer it builds on, is stored in.
 
     Raises:

@@ -69,9 +69,6 @@ def call(area: str, name: str, command: CommandRow, arguments: list[str], **more
 
     Args:
         area: Folder of the command line, which is its name too: `eval`.
-        name: The command's.
-        command: Its row.
-        arguments: What was typed.
         **more: What the function gets besides, if it has an argument of that name.
 
     Returns:

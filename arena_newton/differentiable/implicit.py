@@ -43,6 +43,11 @@ _WORLD_AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0
                         [[0, 0, 0, -1], [0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0]]], dtype=np.float64)  # fmt: skip
 """The same with the unit to the left, about axis i of the world."""
 
+_CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0],
+                   [0, 0, 1, 0, 0, 0, -1, 0, 0],
+                   [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=np.float64)  # fmt: skip
+"""Of a vector, the nine numbers of the matrix of its cross product."""
+
 Scaled = list[tuple[str, list[int] | tuple[list[int], int]]]
 """Fields of a MuJoCo model, and the index of the numbers in each, that one parameter scales."""
 
@@ -168,6 +173,7 @@ class ImplicitWorld:
         ]
         """Address of position, of velocity, and rigid bodies of each free joint that is its tree's only one."""
         self._turns = np.array([[dof + 3, dof + 4, dof + 5] for _, dof, _ in self._alone], int).reshape(-1, 3)
+        self._own = np.array([range(dof, dof + 6) for _, dof, _ in self._alone], int).reshape(-1, 6)
         self._lumped: tuple[bytes, np.ndarray, np.ndarray, np.ndarray] | None = None
         self._line_q = np.setdiff1d(np.arange(model.nq), [q + i for q, _ in self._quats for i in range(4)])
         self._line_v = np.setdiff1d(np.arange(model.nv), [v + i for _, v in self._quats for i in range(3)])
@@ -339,12 +345,13 @@ class ImplicitWorld:
         rates = np.zeros_like(mass)
         rates[rows, columns] = d.qDeriv
         y = h * _solved(mass - h * np.diag(self._damping(m)), at_v)
-        for _, dof, _ in self._alone:
-            own = slice(dof, dof + 6)
-            y[:, own] = h * np.linalg.solve((mass[own, own] - h * rates[own, own]).T, at_v[:, own].T).T
+        if self._alone:
+            own = self._own
+            blocks = (mass - h * rates)[own[:, None], own[:, :, None]]
+            y.T[own] = h * np.linalg.solve(blocks, at_v.T[own])
         w = _solved(mass + constrained, y @ mass)
         at_v = at_v - (stiffened * (w @ jacobian.T)) @ jacobian + w @ rates
-        _, turned, spun = self._spinning(step, y)
+        turned, spun = self._spinning(step, y)
         at_q, at_v = at_q + turned + self._by_position(step, y, w, jacobian != 0.0), at_v + spun
         torque = self._torque(m, step, targets)
         driven = np.where((torque > self._low) & (torque < self._high), w, 0.0)
@@ -355,38 +362,38 @@ class ImplicitWorld:
         damped = bias[:, 2] * (drive * step.v[self._dof] + (y * step.change)[:, self._dof])
         return at_q, at_v, gain * drive, np.stack([stiff, damped]), y, w
 
-    def _spinning(self, step: _Substep, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sum y · D (v' - v) of the bodies that move freely by themselves; its gradients to position and velocity.
+    def _spinning(self, step: _Substep, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients to position and velocity of y · D (v' - v) of the bodies that move freely by themselves.
 
         Of such a body's centre at r, mass m and inertia I in its frame Q, C is m ω × (ω × r) as a force, in Q, and
-        ω × I ω as a torque about the centre.
+        ω × I ω as a torque about the centre. The sum itself is its gradient to v, times v.
         """
         at_q, at_v = np.zeros_like(y), np.zeros_like(y)
         if not self._alone:
-            return np.zeros(len(y)), at_q, at_v
-        mass, r, inertia = self._lumps()
+            return at_q, at_v
+        mass, lever, inertia = self._lumps()
         frames = np.empty((len(self._alone), 9))
         for frame, (qpos, *_) in zip(frames, self._alone, strict=True):
             mujoco.mju_quat2Mat(frame, step.q[qpos + 3 : qpos + 7])
         turns = self._turns
-        spin, c, z = step.v[turns][:, None], step.change[turns][:, None], y.T[turns].transpose(0, 2, 1)
+        spin, change, z = step.v[turns][:, None], step.change[turns][:, None], y.T[turns].transpose(0, 2, 1)
         pull = y.T[turns - 3].transpose(0, 2, 1) @ frames.reshape(-1, 3, 3)
-        p = pull + _cross(z, r)
-        force = mass * (_cross(c, _cross(spin, r)) + _cross(spin, _cross(c, r)))
-        by_spin = mass * (_cross(r, _cross(p, c)) + _cross(_cross(c, r), p))
-        by_spin += _cross(z, c) @ inertia + _cross(c @ inertia, z)
+        across, turned = _crossed(change), _crossed(change @ lever)
+        force = mass * (change @ _crossed(spin @ lever) + spin @ turned)
+        by_spin = (pull + z @ lever) @ (-mass * (across @ lever + turned))
+        by_spin += z @ (across @ inertia - _crossed(change @ inertia))
         at_v[:, turns] = -by_spin.transpose(1, 0, 2)
-        at_q[:, turns] = -_cross(force, pull).transpose(1, 0, 2)
-        return -(by_spin * spin).sum(axis=(0, 2)), at_q, at_v
+        at_q[:, turns] = (pull @ _crossed(force)).transpose(1, 0, 2)
+        return at_q, at_v
 
     def _lumps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass, centre and inertia of the bodies that move freely, shapes [n, 1, 1], [n, 1, 3] and [n, 3, 3]."""
+        """Mass, `_crossed` centre and inertia of bodies that move freely, shapes [n, 1, 1], [n, 3, 3], [n, 3, 3]."""
         m = self._inverse
         key = m.body_mass.tobytes() + m.body_inertia.tobytes()
         if self._lumped is None or self._lumped[0] != key:
             found = zip(*(_lump(m, bodies) for *_, bodies in self._alone), strict=True)
             mass, centre, inertia = map(np.array, found)
-            self._lumped = key, mass[:, None, None], centre[:, None], inertia
+            self._lumped = key, mass[:, None, None], _crossed(centre[:, None]), inertia
         return self._lumped[1:]
 
     def _jacobian(self) -> np.ndarray:
@@ -446,7 +453,7 @@ class ImplicitWorld:
             d.qpos[:], d.qvel[:], d.qacc[:] = step.q, step.v, step.a
             mujoco.mj_inverse(m, d)
             mujoco.mj_mulM(m, d, product, step.a - step.change / m.opt.timestep)
-            total += y @ product - w @ d.qfrc_inverse + self._spinning(step, y)[0]
+            total += y @ product - w @ d.qfrc_inverse + self._spinning(step, y)[1] @ step.v
         return total
 
     def _tangent(self, qpos: np.ndarray, gradient: np.ndarray) -> np.ndarray:
@@ -500,7 +507,7 @@ def _lump(m: mujoco.MjModel, bodies: Sequence[int]) -> tuple[float, np.ndarray, 
     return mass, centre, sum(own + part * (s @ s * np.eye(3) - np.outer(s, s)) for part, s, own in arms)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products over the last dimension, in half of `np.cross`'s time."""
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+def _crossed(b: np.ndarray) -> np.ndarray:
+    """Matrices with which rows a give a × b, shape [n, 3, 3], of vectors b, shape [n, 1, 3]."""
+    found: np.ndarray = (b @ _CROSS).reshape(-1, 3, 3)
+    return found

@@ -103,7 +103,6 @@ def held_folder(out: Path, doing: str, flag: str = "--out") -> Iterator[int]:
     """A folder, made where there is none and kept from other processes while the block lasts.
 
     Args:
-        out: The folder.
         doing: What another process does there, in the message: "trains in it".
         flag: What the message names.
 

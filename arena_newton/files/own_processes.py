@@ -48,9 +48,6 @@ def start_module(
     """Start a module as a program.
 
     Args:
-        module: Its name.
-        *arguments: Its command line.
-        variables: Its environment.
         files: Open files that it keeps.
         output: Where it writes: nowhere, or an open file; `subprocess.PIPE` stands for its input too, without buffers.
         errors: Where it writes errors, by default where this process does.

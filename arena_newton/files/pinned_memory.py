@@ -12,7 +12,6 @@ def pin(memory: torch.Tensor, device: torch.device) -> bool:
 
     Args:
         memory: Contiguous, on the host; must be given to `unpin` before it is freed.
-        device: The GPU.
     """
     with torch.cuda.device(device):
         if int(torch.cuda.cudart().cudaHostRegister(memory.data_ptr(), memory.nbytes, 0)) == 0:

@@ -57,7 +57,6 @@ def read_bytes(path: str | Path, most: int, *, where: str = "") -> bytes:
     """The content of a regular file.
 
     Args:
-        path: The file.
         most: Largest size that is read [bytes].
         where: What errors name; the path by default.
 
@@ -121,7 +120,6 @@ def read_arrays(
     """Read arrays of an NPZ file; no object arrays, and none that is larger than `limits` says.
 
     Args:
-        path: The file.
         wanted: Names of the arrays to read, where the file has them; all by default. The others are not
             unpacked and are returned as empty arrays.
         where: What errors name; the path by default.

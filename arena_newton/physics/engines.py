@@ -30,7 +30,6 @@ def make_physics(
     """Engine `mujoco` or `warp` over a scene.
 
     Args:
-        scene: The scene.
         rate: The tracker's physics rate.
         engine: `mujoco` or `warp`.
         threads: CPU threads of engine `mujoco`; all by default.

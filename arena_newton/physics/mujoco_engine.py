@@ -143,7 +143,6 @@ class MujocoPhysics(Physics):
         """Put a world into a state; what its solver starts from stays.
 
         Args:
-            world: World index.
             qpos: Positions, shape [nq].
             qvel: Velocities, shape [nv].
         """

@@ -379,7 +379,6 @@ def load_scene(
 
     Args:
         task: Task name, or path of a stage.
-        worlds: Number of parallel worlds.
         device: Warp device of the Newton model.
         variant: Variant of the set `semantics` on `/World`; None keeps the layer's own selection.
         hands: `dex3` or `fixed`.

@@ -40,7 +40,7 @@ _STATE = (
 
 
 class WarpPhysics(Physics):
-    """mujoco_warp: all worlds in one launch; on CUDA the substeps of a tick are one captured graph."""
+    """mujoco_warp: all worlds in one launch; the substeps of a tick are one captured graph."""
 
     engine = "warp"
 
@@ -135,14 +135,9 @@ class WarpPhysics(Physics):
                 self._before = self._before or [wp.empty_like(words) for words in self._state]
                 for saved, words in zip(self._before, self._state, strict=True):
                     wp.copy(saved, words)
-            if self.device.is_cuda:
-                if self._tick_graph is None:
-                    began = self.snapshot()
-                    self._tick_graph = self._capture(self._launch_tick)
-                    self.restore(began)
-                wp.capture_launch(self._tick_graph)
-            else:
-                self._launch_tick()
+            if self._tick_graph is None:
+                self._tick_graph = self._capture(self._launch_tick)
+            wp.capture_launch(self._tick_graph)
             if hold and self._before is not None:
                 self._put_back(self._before, self._idle)
 
@@ -163,17 +158,17 @@ class WarpPhysics(Physics):
             mujoco_warp.step(self._m, self._d)
 
     def _capture(self, work: Callable[[], None]) -> wp.Graph:
-        work()
+        """Launches as a graph; the worlds stay where they are."""
+        began = self.snapshot()
+        work()  # loads what is launched
         with wp.ScopedCapture(self.device) as capture:
             work()
+        self.restore(began)
         return capture.graph
 
     def mj_step_only(self) -> None:
         """See `Physics.mj_step_only`."""
         with wp.ScopedDevice(self.device):
-            if not self.device.is_cuda:
-                self._launch_solver()
-                return
             if self._solver_graph is None:
                 self._solver_graph = self._capture(self._launch_solver)
             wp.capture_launch(self._solver_graph)

@@ -33,11 +33,7 @@ PATIENCE = 50
 
 
 def room_walls(model: mujoco.MjModel) -> tuple[tuple[np.ndarray, float], ...]:
-    """Inward normal and offset [m] of the upright planes that bound a scene's room.
-
-    Args:
-        model: MuJoCo model.
-    """
+    """Inward normal and offset [m] of the upright planes that bound a scene's room."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -115,10 +111,7 @@ class Follower:
 
         Args:
             camera: Camera with at least as many views as worlds are given.
-            state: Newton state.
-            worlds: World of each picture.
             pelvises: x and y of each pelvis [m].
-            ticks: Tick of each picture.
         """
 
         def pose(index: int, offset: int) -> np.ndarray:

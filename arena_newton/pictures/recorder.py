@@ -101,7 +101,6 @@ class EpisodeRecorder(Recorder):
         Args:
             folder: Folder in which `videos/` and `strips/` are written.
             video: Write H.264 MP4s.
-            strip: Write film strips.
             episodes: Number of episodes with videos, the first of each task, tracker and mode in the order of the plan;
                 all by default.
             size: Width and height of world videos [px]; head camera videos are as high, 4:3. 480×270 (and 320×240) by

@@ -111,7 +111,6 @@ class WorldViewer(Recorder):
         """Show the worlds of another environment from now on.
 
         Args:
-            env: The worlds.
             name: What they are called; `usd` writes into a folder of that name, a numbered one where it exists.
         """
         self._finish_file()

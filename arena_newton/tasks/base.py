@@ -433,7 +433,6 @@ class TaskSpec:
         """Everything random about the episode with this seed.
 
         Args:
-            seed: Episode seed.
             mode: One of `modes.names()`.
             rules: Rule set; it decides where a sample is put.
             samples: Record name → sample, instead of those that the seed draws.

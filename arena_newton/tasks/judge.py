@@ -133,7 +133,6 @@ class Judge:
         """Allocate the outputs.
 
         Args:
-            scene: The built scene.
             predicates: Those of the task; the last one is success.
             conditions: Conditions of every predicate but the last, by its name.
 
@@ -282,7 +281,6 @@ class ConditionsJudge(Judge):
         """Bind conditions to the scene.
 
         Args:
-            scene: The built scene.
             predicates: As of `Judge`.
             conditions: As of `Judge`.
             success: Conditions of success.

@@ -41,8 +41,6 @@ def first_tick(task: str, worlds: int, threads: int) -> None:
     """Build an environment with a camera, look once, play a tick, and print the seconds of each part as JSON.
 
     Args:
-        task: Task.
-        worlds: Worlds.
         threads: Threads that load kernels; 1: one module after the other. 0: as many as usual.
     """
     quiet_warp()

@@ -41,9 +41,7 @@ def tick_times(
         worlds: Worlds of the football scene.
         engine: ``mujoco`` or ``warp``.
         rate: Rate of the physics.
-        rounds: Rounds.
         checkpoint: Weights of TWIST2; those of the package when None.
-        count: Ticks of a round.
 
     Returns:
         Per round: seconds of a full tick, seconds of the solver's steps of a tick.

@@ -146,14 +146,10 @@ class RepeatedEpisodes:
         """Plan the episodes and build the environment.
 
         Args:
-            task: Task.
             policy: Policy; the pictures that it needs are rendered.
-            repeats: Episodes of each group seed.
-            seeds: Group seeds.
             worlds: Episodes at once; all when None.
             cuda: Engine warp on CUDA, instead of mujoco on the CPU.
             checkpoint: Weights of TWIST2; those of the package when None.
-            seed_range: Range of the episodes' seeds.
         """
         self.policy = policy
         self.episodes = episode_plan.expand(

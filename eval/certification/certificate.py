@@ -65,8 +65,6 @@ def write(folder: Path, facts: Facts, findings: Mapping[Check, CheckFinding]) ->
 
     Args:
         folder: The certification's.
-        facts: What was certified.
-        findings: What was found so far.
     """
     write_atomic(folder / FILE, json.dumps(document(folder, facts, findings), indent=2) + "\n")
     for name, page in markdown(facts, findings).items():

@@ -85,7 +85,6 @@ def run(
     """Run the checks, print a line for each, and write the certificate's files.
 
     Args:
-        options: The flags.
         factories: What evaluations are built with; the real parts by default.
         bodies: Robots for the checks of legs, and scripted failures.
         checks: What is checked, of which `options.checks` may choose.

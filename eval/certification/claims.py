@@ -86,7 +86,6 @@ def claimed(findings: Mapping[Check, CheckFinding], claims: Sequence[Claim] = CL
     """Findings by claim; a check of no claim is one of its own, its question.
 
     Args:
-        findings: What was found.
         claims: In their order.
     """
     known = {name for claim in claims for name in claim.checks}
@@ -103,7 +102,6 @@ def verdict_of(findings: Mapping[Check, CheckFinding], planned: int) -> str:
     """The whole in one sentence.
 
     Args:
-        findings: What was found so far.
         planned: How many checks are to be run.
     """
     counts = Counter(one.verdict for one in claimed(findings))

@@ -70,7 +70,6 @@ def failure_cells(records: Iterable[EpisodeRecord], own: Iterable[EpisodeRecord]
     """Cells in the order of the plan; those without signals are left out.
 
     Args:
-        records: Episodes of a run.
         own: Replays of their actions through the policy's own tracker.
     """
     groups: dict[tuple[str, str, str, str], list[EpisodeRecord]] = {}

@@ -165,9 +165,6 @@ def original_files(
 
     Args:
         records: Episodes in the plan's order.
-        gym_ids: Gym ids by task.
-        seeds: Group seeds of the plan.
-        repeats: Episodes of each.
     """
     found: dict[str, str] = {}
     for task, tracker, mode in dict.fromkeys((r.task, r.tracker, r.mode) for r in records):

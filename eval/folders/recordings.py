@@ -27,8 +27,6 @@ def packed_actions(
 
     Args:
         actions: Canonical actions, one per tick, each of shape [40].
-        episode_seed: The episode's seed.
-        gym_id: The task's Gym id.
         mode: One of `modes.names()`.
         queries: Ticks at which the policy was asked, where they are known.
 

@@ -60,7 +60,6 @@ def recorded_bytes(budgets: Mapping[str, int], episodes: int, size: str) -> int:
 
     Args:
         budgets: Task → most ticks of an episode.
-        episodes: Successes of each task.
         size: Of the pictures, such as `224x224`.
     """
     width, height = map(int, size.split("x"))

@@ -296,8 +296,6 @@ def suite_text(plan: LoopPlan, row: PlanRow, trainings: Mapping[int, Path]) -> s
     """The suite file of a row: its trainings on all tasks through all trackers.
 
     Args:
-        plan: The plan.
-        row: One of its rows.
         trainings: Seed → folder of the training.
     """
     trackers = plan.record.tracker or ("twist2",)

@@ -92,10 +92,8 @@ def training_minutes(plan: LoopPlan, given: float | None, out: Path, trainings: 
     """Time of each training [min]: the plan's, or an equal part of what recording and building leave of a time for all.
 
     Args:
-        plan: The plan.
         given: Time of all stages [min].
         out: Folder in which demonstrations were recorded and datasets built, and trainings perhaps failed.
-        trainings: Number of trainings.
         gpus: GPUs of this machine, on which some of them run at once.
 
     Raises:

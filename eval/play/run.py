@@ -139,9 +139,7 @@ def make_env(config: RunConfig, factories: Factories, episode: Episode, worlds: 
 
     Args:
         config: The run, with the parts of `check_parts`.
-        factories: What it is built with.
         episode: One of its episodes.
-        worlds: Worlds in the batch.
     """
     _freeze_libraries()
     flags = config.flags

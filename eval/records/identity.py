@@ -45,7 +45,10 @@ __all__ = [
 ]
 
 PACKAGE = Path(arena_newton.__file__).resolve().parent
+REPORTERS = ("eval/folders", "eval/records", "eval/reports", "eval/statistics", "pages")
+"""Rooms that write the tables and reports of a run."""
 UNHASHED = (
+    *REPORTERS,
     "data/checks",
     "data/datasets",
     "eval/adapters",
@@ -53,17 +56,12 @@ UNHASHED = (
     "eval/bench",
     "eval/certification",
     "eval/commands",
-    "eval/folders",
     "eval/leaderboard",
     "eval/loop",
-    "eval/records",
-    "eval/reports",
-    "eval/statistics",
     "eval/studies",
     "eval/suites",
     "eval/tables",
     "eval/workers",
-    "pages",
     "policies/recipes",
     "policies/train",
     "trackers/evaluation",
@@ -71,8 +69,6 @@ UNHASHED = (
 )
 """Rooms that prepare, report or measure but move and judge no episode of a run, as command lines do
 (`__main__.py`). All other code counts, whatever is added to the package."""
-REPORTERS = ("eval/folders", "eval/records", "eval/reports", "eval/statistics", "pages")
-"""Those of them that write the tables and reports of a run."""
 UNVERSIONED = ("arena-newton", "av", "jinja2", "matplotlib", "rsl-rl-lib", "tqdm", "tyro")
 """Distributions that move and judge no episode; the versions of all others must not change within a results folder."""
 UNRULED = (

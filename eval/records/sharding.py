@@ -117,7 +117,6 @@ def dealt(keys: Sequence[tuple[Hashable, ...]], shard: Shard) -> list[int]:
 
     Args:
         keys: Of each planned episode, in the plan's order: task, tracker, mode, group seed, repeat.
-        shard: The part.
     """
     groups: dict[tuple[Hashable, ...], list[tuple[bytes, int]]] = {}
     for index, key in enumerate(keys):

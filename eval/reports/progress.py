@@ -69,7 +69,6 @@ class Progress:
         """Show the beginning.
 
         Args:
-            budget: Ticks of all planned episodes.
             planned: Number of planned episodes.
             finished: Number of them that have ended already.
             done: Their ticks.

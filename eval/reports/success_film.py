@@ -48,7 +48,6 @@ def write(runs: Sequence[RunRecord], target: Path, seconds: float, width: int, m
 
     Args:
         runs: Runs whose successes it shows.
-        target: The file.
         seconds: Length of a film [s].
         width: Its width [px].
         max_mb: Largest size of a .webp film [MB].

@@ -132,7 +132,6 @@ class PlacedWorlds:
         """Play episodes; results are in their order, whatever order they end in.
 
         Args:
-            episodes: What to play.
             on_finish: Called with each result as it ends.
             on_tick: Called each tick with the number of active worlds.
         """

@@ -32,7 +32,6 @@ def draw_grid(
         axes: One or two; the first is horizontal.
         grid: Values along each axis.
         points: One per point; the last axis changes fastest.
-        title: Of the figure.
     """
     horizontal = grid[0]
     vertical = grid[1] if len(grid) > 1 else (0.0,)

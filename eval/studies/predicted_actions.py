@@ -165,7 +165,6 @@ def predict(
     Args:
         policy: Asked for `batch` observations at once, after a reset each time, without an environment.
         data: Where the pictures are.
-        samples: Observations.
         batch: Observations at once; the last batch is filled up with its first one.
         seed: Chooses the episode seeds that the policy is given.
 

@@ -124,7 +124,6 @@ def search(
         play: Scores of placements.
         batches: How many, the first among them.
         size: Placements of a batch.
-        seed: Of the search.
 
     Returns:
         All placements in the order of their playing, and their scores.

@@ -285,7 +285,6 @@ class CellPlayer:
         """Journal and say how cells ended that were played at once.
 
         Args:
-            names: The cells.
             code: Exit code of their run; 130 when it was interrupted.
             error: Why they could not be played.
             wall: Time that they took [s].

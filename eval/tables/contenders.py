@@ -124,7 +124,6 @@ def read_contenders(
     A results folder is a contender of the folder's name; a suite has one for each of its policies and conditions.
 
     Args:
-        folders: Each of them.
         differ: Names of `CONDITIONS` that may differ.
         only: Names of the contenders to keep; all by default.
         per_tracker: Whether each tracker of a folder makes a contender of its own.

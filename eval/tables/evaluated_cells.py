@@ -47,7 +47,6 @@ def read_cells(folders: Sequence[Path], rules: str = "paper") -> CellSet:
     """Read suites (folders with `suite.json`), results folders, and files `cells.csv` that `eval tables` wrote.
 
     Args:
-        folders: Each of them.
         rules: Rule set whose episodes count; others are left out and counted in a note. A `cells.csv` does not say
             its own, and is taken to be of these.
 

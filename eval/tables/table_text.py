@@ -49,7 +49,6 @@ def as_csv(tables: Sequence[SuiteTable], changed: bool = False) -> str:
     """One line per number, fields of `TableEntry`; fractions in [0, 1], empty where a number is undefined.
 
     Args:
-        tables: All tables.
         changed: Our episodes are no results of the benchmark, which their source says.
     """
     names = [field.name for field in dataclasses.fields(TableEntry)]

@@ -63,11 +63,8 @@ def play(
     """Play the episodes of a batch.
 
     Args:
-        part: Episodes to play.
         config: The run, with all its episodes.
         path: Its results folder.
-        factories: What environments are built with.
-        policy: The policy.
         send: Takes events.
 
     Raises:

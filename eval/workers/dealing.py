@@ -146,8 +146,6 @@ class DealtRun:
         """Take what is to be played of a run whose folder was prepared.
 
         Args:
-            job: The run.
-            journal: Its journal.
             pool: Who plays.
             ended: Finished episodes by number.
             waiting: Those to play by group.

@@ -75,7 +75,6 @@ class LocalBackend:
 
         Args:
             jobs: Processes at once.
-            device: Device of the runs.
         """
         self.flag, self._jobs, self._cores = f"--jobs {jobs}", jobs, len(os.sched_getaffinity(0))
         self._gpus = [] if device == "cpu" else visible_gpus()

@@ -178,7 +178,6 @@ class RayBackend:
 
         Args:
             flags: How many, and what each asks for.
-            device: Device of the runs.
 
         Raises:
             InputError: A cluster of our own has no room for one.

@@ -74,7 +74,6 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
 
     Args:
         folders: Shards, or folders of the whole plan.
-        out: The new folder.
         partial: Join what there is although episodes are missing.
         accept_versions: Join although other versions of the libraries played them.
 

@@ -137,10 +137,6 @@ class Worker:
 def backend_of(flags: Workers, device: str) -> Iterator[PoolBackend]:
     """Processes that flags ask for.
 
-    Args:
-        flags: The flags, checked.
-        device: Device of the runs.
-
     Raises:
         InputError: No cluster answers, or it has no room.
     """

@@ -46,7 +46,6 @@ def football_kernel(
     """Football: the ball's centre inside the goal's volume, with (`paper`) or without (`released`) its rear face.
 
     Args:
-        ball_body: The ball.
         goal: One box whose +y face is the rear of the net.
         pitch: One box; xy beyond its upright faces is out.
         rear_bound: Whether the +y face bounds the goal.
@@ -118,7 +117,6 @@ def launch_double_desk(
     """DoubleDesk: the hammer's centre of mass inside the crate's box.
 
     Args:
-        hammer_body: The hammer.
         inside: One box, the crate's.
         min_z: None: the box is in the crate's own frame (`paper`). Otherwise it is the world-axis box around the
             crate's, cut at this height [m] (`released`).

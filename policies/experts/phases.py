@@ -27,8 +27,6 @@ class Phases:
 
         Args:
             longest: Phase → longest time in it [s], in the usual order; `math.inf` for the last one.
-            worlds: Number of worlds.
-            device: Of the tensors.
         """
         self._names = list(longest)
         self._index = {name: i for i, name in enumerate(longest)}

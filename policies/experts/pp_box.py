@@ -518,7 +518,6 @@ def pose_before(point: Tensor, yaw: Tensor, distance: Tensor) -> Tensor:
     """Pose from which a point [m], shape [worlds, 2], is straight ahead.
 
     Args:
-        point: The point.
         yaw: Heading of the pose [rad], shape [worlds].
         distance: Way to the point [m], shape [worlds].
 

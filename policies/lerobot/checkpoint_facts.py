@@ -134,7 +134,6 @@ def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker:
     Args:
         tasks: In the order of their numbers.
         trackers: In the order of their numbers, after which one more is that of any other tracker.
-        task: Name.
         tracker: Name; empty: not known.
     """
     vector = [float(name == task) for name in tasks]

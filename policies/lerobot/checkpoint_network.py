@@ -88,7 +88,6 @@ class PolicyNetwork:
         Args:
             seen: Observations by their names in datasets, float32 on the device, shape [rows, ...], or for policies
                 that look at several ticks [rows, ticks, ...]; pictures from 0 to 1, channels first.
-            instruction: Sentence of the task.
             draws: Whose noise each row has.
 
         Returns:

@@ -27,8 +27,6 @@ class ChunkMemory:
         """All worlds at the beginning of an episode.
 
         Args:
-            worlds: Number of worlds.
-            device: Torch device of the actions.
             observations: Ticks that the policy looks at.
             predicted: Actions of an answer of the network.
             executed: Actions of an answer that are executed before the next query.

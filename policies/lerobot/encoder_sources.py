@@ -129,7 +129,6 @@ def made_clip(sizes: Mapping[str, int], picture: int, tokens: int, tokenizer: Pr
         sizes: `hidden` width, `layers`, `heads`, `patch` [px].
         picture: Width and height [px].
         tokens: Longest instruction.
-        tokenizer: Its vocabulary.
 
     Raises:
         InputError: A size is missing or cannot be.

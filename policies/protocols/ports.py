@@ -22,7 +22,6 @@ def bind(port: int, flag: str, host: str = LOCAL) -> socket.socket:
     Args:
         port: TCP port; 0 takes a free one.
         flag: What the message names.
-        host: Address of this machine.
 
     Raises:
         InputError: The port is taken or not allowed.

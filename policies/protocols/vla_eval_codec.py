@@ -218,7 +218,6 @@ def unpack_action(message: VlaEvalMessage, seq: int, where: str) -> np.ndarray:
     """The chunk of an answer, float32, shape [n, 40].
 
     Args:
-        message: The answer.
         seq: Of the query that it must answer.
         where: What errors name as the origin.
 

@@ -57,9 +57,7 @@ class ServerLink[Q, R]:
 
         Args:
             kind: What is asked, as errors name it behind the address.
-            request: The request.
             timeout: Deadline of all attempts together [s].
-            retries: Repeated attempts.
             backoff: Pause before the first of them [s]; it doubles each time.
 
         Raises:

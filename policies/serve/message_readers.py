@@ -43,7 +43,6 @@ class MessageReaders:
 
         Args:
             size: Bytes of the message, or of the picture that it unpacks.
-            read: Reads it.
 
         Raises:
             CancelledError: The readers are closed.

@@ -282,7 +282,6 @@ class PolicyServer:
 
         Args:
             size: Bytes of the message.
-            read: Reads it.
 
         Raises:
             Refused: The server closes.

@@ -41,7 +41,6 @@ def serve_policy(options: ServeOptions, say: Say | None = None, stop: threading.
     """Serve until Ctrl-C.
 
     Args:
-        options: The flags.
         say: Takes the lines of the console; they are printed by default.
         stop: Ends the server, too.
 

@@ -34,9 +34,6 @@ LARGEST_SEED = 2**31 - 1
 def make_world(options: SessionOptions) -> ArenaEnv:
     """The one world of a session.
 
-    Args:
-        options: The flags.
-
     Raises:
         InputError: A flag names something unknown or absent.
     """
@@ -77,7 +74,6 @@ def drive(
     Args:
         env: The world; closed at the end.
         source: What a person drives with; closed at the end.
-        options: The flags.
         displays: See `TeleopSession`.
 
     Returns:
@@ -115,10 +111,6 @@ def drive(
 def session_facts(env: ArenaEnv, options: SessionOptions) -> dict[str, object]:
     """Facts on which the motion of a session's episodes depends, as `eval record --from` compares them with its own.
 
-    Args:
-        env: The world.
-        options: The flags.
-
     Returns:
         JSON.
     """
@@ -149,9 +141,6 @@ def _camera(options: SessionOptions) -> CameraConfig | None:
 
 def drive_by_browser(options: BrowserOptions) -> int:
     """Serve the page and run the session.
-
-    Args:
-        options: The flags.
 
     Returns:
         Exit code 0.

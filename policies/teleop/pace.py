@@ -85,7 +85,6 @@ class TimedPicture:
         """Draw at the first occasion.
 
         Args:
-            draw: Draws it.
             period: Shortest time between two [s].
         """
         self._draw, self.period = draw, period
@@ -100,9 +99,6 @@ class TimedPicture:
 
     def try_draw(self, pace: Pace) -> bool:
         """Draw if it is due and there is time.
-
-        Args:
-            pace: The clock.
 
         Returns:
             Whether it was drawn.

@@ -13,9 +13,6 @@ __all__ = ["drive_by_redis"]
 def drive_by_redis(options: RedisOptions) -> int:
     """Take a sender's actions from a Redis server and run the session.
 
-    Args:
-        options: The flags.
-
     Returns:
         Exit code.
 

@@ -203,9 +203,5 @@ class GmrReference(Reference):
 
 
 def references(tracker: str) -> Reference:
-    """The kind of reference that a tracker was driven with in the original; those that it did not know get TWIST2's.
-
-    Args:
-        tracker: Its name.
-    """
+    """The kind of reference that a tracker was driven with in the original; those that it did not know get TWIST2's."""
     return GmrReference() if tracker == "sonic" else MimicReference()

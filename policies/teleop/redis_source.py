@@ -49,11 +49,6 @@ RESET: Control = "discard_and_reset"
 def connect(host: str, port: int, db: int) -> redis.Redis:
     """A connection to a Redis server that answers.
 
-    Args:
-        host: Its address.
-        port: Its TCP port.
-        db: Number of its database.
-
     Raises:
         InputError: It does not answer, or has no such database.
     """

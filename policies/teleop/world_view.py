@@ -58,7 +58,6 @@ class WorldView:
         """Begin to serve.
 
         Args:
-            env: The environment.
             port: TCP port of viser; 0 takes a free one.
             token: What the socket's address must name.
 

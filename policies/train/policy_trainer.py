@@ -64,8 +64,6 @@ class PolicyTrainer:
             weights: Of each pair of task and tracker in the draw of the samples; None: every picture counts alike.
             graph: On CUDA: capture a step in a graph, where the model can be captured.
             compiled: Compile the networks, at the first step.
-            rank: Number of this process.
-            ranks: Number of processes.
 
         Raises:
             InputError: The family cannot be compiled.

@@ -30,7 +30,6 @@ def resumed(
 
     Args:
         options: Flags that were given with `--resume`.
-        content: Stored flags.
         where: Checkpoint that they are of.
         named: Fields that were given though they have their default's value.
 

@@ -80,8 +80,6 @@ def read_demonstrations(folder: Path, task: str, tracker: str) -> Demonstrations
 
     Args:
         folder: As `eval record` writes it.
-        task: Task name.
-        tracker: Name of the tracker.
 
     Raises:
         InputError: There are none, they have different objects, or a file is damaged.
@@ -124,7 +122,6 @@ class PoseNetwork(nn.Module):
         """New weights.
 
         Args:
-            inputs: Number of features.
             chunk: Actions of an answer.
         """
         super().__init__()
@@ -159,10 +156,7 @@ def fitted(
     """Train a network.
 
     Args:
-        data: Demonstrations.
         chunk: Actions of an answer; after an episode's end nothing is asked.
-        steps: Optimizer steps.
-        batch_size: Rows of a step.
         seed: Of weights, rows and noise.
         on_step: Called with each step and its loss, in standard deviations of the actions.
     """

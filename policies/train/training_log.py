@@ -29,9 +29,7 @@ class TrainingLog:
         """Open the log.
 
         Args:
-            folder: Folder of the training.
             step: Step at which the training goes on; later rows of an interrupted part are dropped.
-            quiet: Show no bar.
             pairs: Names of the pairs that have columns of their own.
         """
         self._path = folder / LOG_FILE

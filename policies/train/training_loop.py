@@ -73,8 +73,6 @@ class TrainingLoop:
         """Prepare the loop; nothing is written yet.
 
         Args:
-            options: Flags.
-            out: Folder of the training.
             trainer: At the step from which it goes on.
             facts: What checkpoints say, but for steps and time.
             processes: This process and the others.

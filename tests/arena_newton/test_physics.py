@@ -246,6 +246,19 @@ def test_a_snapshot_brings_everything_back(door):
     assert _same(now, runs[0], [0]) and _same(now, before, [1])
 
 
+def test_a_captured_tick_has_the_bits_of_its_launches(football_warp):
+    """On the CPU the graph of a tick, which a physics plays, moves the worlds as the launches by themselves do."""
+    runs = []
+    for tick in ("step", "_launch_tick"):
+        physics = make_physics(football_warp, PhysicsRate(0.005, 4), "warp")
+        _standing(physics)
+        with wp.ScopedDevice(physics.device):
+            for _ in range(5):
+                getattr(physics, tick)()
+        runs.append(_bits(physics))
+    assert _same(*runs, slice(None)) and runs[0]["contact_force"].any()
+
+
 def test_an_idle_world_keeps_every_bit(door):
     """A world that is not active stands still bit for bit, later runs as if nothing had been, and disturbs nobody."""
     _closed(door)

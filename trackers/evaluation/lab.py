@@ -114,7 +114,6 @@ class Lab:
             kinds: Properties of each world.
             watched: Worlds whose force between supports and robot is reported, bool, shape [worlds].
             engine: `auto`, `mujoco` or `warp`.
-            device: Warp device.
             threads: CPU threads of engine `mujoco`; all by default.
 
         Raises:

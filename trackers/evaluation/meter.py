@@ -66,7 +66,6 @@ class Meter:
         """Allocate.
 
         Args:
-            lab: The worlds.
             end: Length of each rollout [ticks], shape [worlds].
             window: First tick that counts for mean speeds, shape [worlds].
             traced: Number of ticks whose errors are kept.

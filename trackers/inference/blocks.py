@@ -183,9 +183,7 @@ class BlockRunner:
         Args:
             network: Maps [rows, in_width] to [rows, out_width], each row by itself. On the CPU it is exported to ONNX
                 Runtime, unless one of its modules is `on_host`, a session already.
-            in_width: Width of an observation.
             worlds: Rows that the caller fills.
-            device: Where network and buffer are.
         """
         self.network = network
         self.worlds = worlds

@@ -33,7 +33,6 @@ class Quadratic:
             table: For each result the products that it adds, as (i width + j, factor); equally many for each.
             constant: Added to each result.
             width: Width of `b`.
-            device: Torch device of the rows.
         """
         by_term = [term for terms in zip(*table, strict=True) for term in terms]
         self._left = torch.tensor([i // width for i, _ in by_term], device=device)

@@ -116,7 +116,6 @@ def read_library(
         paths: The files; clips of libraries keep their family, licence and source.
         options: What the files do not say.
         family: Kind of motion of the clips.
-        licence: Their licence.
         source: Where they are from; their file's name is put behind it.
 
     Raises:

@@ -179,7 +179,6 @@ class MotionLibrary:
 
         Args:
             clips: The clips, of any frame rate.
-            names: Their names.
             family: Kind of motion, of all or of each.
             licence: Licence, of all or of each.
             source: Origin, of all or of each.

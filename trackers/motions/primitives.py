@@ -127,7 +127,6 @@ class Program:
 
         Args:
             scripts: One per world.
-            device: Torch device of the commands.
         """
         longest = max(len(s.segments) for s in scripts)
         ends = np.full((len(scripts), longest), np.inf, dtype=np.float32)

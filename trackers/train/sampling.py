@@ -37,7 +37,6 @@ class ClipSampler:
         """Cut the clips into bins.
 
         Args:
-            bank: The references.
             adaptive: Fraction of the starts that are sampled by failure rate, 0 to 1.
             family_weights: Weights of families by name relative to their seconds of motion; 1 where not named.
         """

@@ -1,4 +1,4 @@
-"""The lab in many worlds as torch tensors: one 50 Hz tick is one CUDA graph, torch and Warp share one stream.
+"""The lab in many worlds as torch tensors: the physics of a 50 Hz tick are one graph, torch and Warp share one stream.
 
 All views are zero-copy. Nothing here waits for the device.
 """
@@ -94,7 +94,7 @@ class Simulation:
         self._parked_pos = self.mocap_pos[:, self._fixtures].clone()
         self._parked_quat = self.mocap_quat[:, self._fixtures].clone()
         self._graph: wp.Graph | None = None
-        self._want_graph = options.graph and device.startswith("cuda")
+        self._want_graph = options.graph
 
     def _launch(self) -> None:
         for _ in range(self.rate.substeps):

@@ -55,7 +55,6 @@ class Tally:
         """Count one tick of every world.
 
         Args:
-            motion: The tick.
             earned: Weighted reward of each term, shape [worlds, terms].
             ends: Which termination terms ended the episode, bool, shape [worlds, terms].
             failed: Whether the episode ended early, bool, shape [worlds].

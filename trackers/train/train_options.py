@@ -124,7 +124,7 @@ class TrainOptions:
     constraints_per_world: int = field(default=160, metadata=bounds(1))
     """Size of the constraint buffer."""
     graph: bool = True
-    """Capture the physics of a tick in a CUDA graph."""
+    """Capture the physics of a tick in a graph, on the CPU too."""
     tick_graph: bool = True
     """Capture the rest of a tick in CUDA graphs."""
     update_graph: bool = True

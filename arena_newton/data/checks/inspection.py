@@ -148,7 +148,6 @@ def page(found: Sequence[EpisodeFigures], shown: Sequence[Shown], title: str) ->
     Args:
         found: Figures of all episodes.
         shown: Those in full, in their order.
-        title: What was looked at.
     """
     anchors = {id(one.figures): f"#episode{number}" for number, one in enumerate(shown)}
     groups: dict[tuple[str, str], list[EpisodeFigures]] = {}

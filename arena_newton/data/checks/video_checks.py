@@ -96,7 +96,6 @@ def check_videos(
     """Decode all frames of some cameras.
 
     Args:
-        files: The dataset.
         cameras: Its cameras, in the order in which mismatches are reported.
         jobs: Threads; each decodes one file at a time.
         progress: Is given the number of frames decoded so far, now and then.

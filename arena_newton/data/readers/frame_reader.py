@@ -78,7 +78,6 @@ class Frames:
         """Read the tables of a dataset.
 
         Args:
-            root: Its folder.
             camera: Feature, or its name after `observation.images.`; the first one by default.
             open_files: Video files that are kept open.
 

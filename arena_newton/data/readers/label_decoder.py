@@ -55,8 +55,6 @@ class V4Decoder:
         """All worlds at the beginning of an episode.
 
         Args:
-            worlds: Number of worlds.
-            device: Torch device of the chunks.
             yaw0: Yaw at the beginning of an episode, in its own frame [rad].
             realign: Fraction of the gap to the measured yaw that is closed each tick; 0: none, and yaws are exact.
             late: Ticks between a measurement and the first action of the chunk that is decoded next: actions of the

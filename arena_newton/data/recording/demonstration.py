@@ -152,7 +152,6 @@ class DemonstrationRecorder(Recorder):
             depth: Record the depth of each picture too, float16 [m].
             looks: Second lights of an episode (`readers.looks`), with the camera `front`; 0: no looks.
             seeds: Range of the seeds, where the seed itself does not tell (`seeding.TELEOPERATION`).
-            only_success: Write successes only.
             facts: What the run depends on, as JSON; it must not name times, folders or numbers of worlds.
             threads: Threads that encode and write. Without any, an episode's files are there when it has ended;
                 with threads, when `saved` names it.

@@ -36,8 +36,6 @@ def noise_series(episode_seed: int, ticks: int, levels: NoiseLevels) -> np.ndarr
     """Noise of an episode from its step 0 on; it begins with none, so that the first action is no jump.
 
     Args:
-        episode_seed: Seed of the episode.
-        ticks: Length.
         levels: How strong and how slow it is.
 
     Returns:

@@ -57,7 +57,6 @@ class SlotMemory:
 
         Args:
             fd: A file of `size` bytes.
-            slots: Number of slots.
             worlds: Pictures of a slot.
             height: Height of a picture [px].
             width: Width of a picture [px].

@@ -30,7 +30,6 @@ def statistics(histogram: np.ndarray, frames: int) -> dict[str, np.ndarray]:
 
     Args:
         histogram: int64, shape [3, 256].
-        frames: Number of pictures.
 
     Returns:
         `min`, `max`, `mean`, `std` and `q01` ... `q99` of shape [3], and `count` of shape [1], the pictures.

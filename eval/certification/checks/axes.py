@@ -300,8 +300,6 @@ def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS)
     """Faults of an episode in which the robot stands: in base mode, with usual values, with each quantity alone.
 
     Args:
-        context: What is certified.
-        task: Task name.
         tracker: Tracker with the weights it comes with.
         mode: Mode whose ranges are tried at their ends, of the two the one further from the usual value.
     """

@@ -103,7 +103,6 @@ def tallies(comparisons: int, episodes: int = EPISODES, seed: int = SEED) -> lis
     Args:
         comparisons: Of each case.
         episodes: Of each policy and task.
-        seed: Of the outcomes.
     """
     found = []
     rng = np.random.default_rng(seed)

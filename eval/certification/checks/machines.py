@@ -208,7 +208,6 @@ def play_by_ray(plan: RunOptions, folder: Path) -> RayRun:
     """Play a plan by a Ray cluster on this machine, and kill one of its processes when the first episode has ended.
 
     Args:
-        plan: What to play.
         folder: New results folder; what the run says is written next to it.
     """
     cluster = replace(plan, ray=(), ray_cpus=1, ray_actors=ACTORS, worlds=RAY_WORLDS, out=str(folder))

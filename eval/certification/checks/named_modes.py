@@ -58,12 +58,6 @@ def named_modes(context: Context) -> CheckFinding:
 def drawn(task: str, name: str, rules: str, seeds: list[int]) -> tuple[list[tuple[str, ...]], list[str]]:
     """Numbers that a mode draws otherwise than base mode, and what is not as its record says.
 
-    Args:
-        task: Task name.
-        name: Name of the mode.
-        rules: Rule set.
-        seeds: Episode seeds.
-
     Returns:
         Rows of object or `dynamics`, number, its range in base mode and here, and what was drawn; and the faults.
     """

@@ -25,9 +25,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 
     Times at which episodes were played are left out of the journal, whose lines are brought into the plan's order, and
     out of the episodes' own files; of config.json what says how the plan was played is left out.
-
-    Args:
-        folder: A results folder.
     """
     found = {}
     for path in sorted(folder.rglob("*")):

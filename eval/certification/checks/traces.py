@@ -55,10 +55,7 @@ def world_of(context: Context, task: str, tracker: str, *, worlds: int, **option
     """Worlds of a task on the certification's engine.
 
     Args:
-        context: What is certified.
-        task: Task name.
         tracker: Tracker with the weights it comes with.
-        worlds: Number of worlds.
         options: Further ones of `ArenaEnv`, such as `mode`, `rules` and `camera`.
     """
     made = context.factories.tracker(tracker, None)

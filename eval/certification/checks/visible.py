@@ -94,7 +94,6 @@ def first_sights(env: World, seeds: list[int], prim: str) -> tuple[list[int | No
 
     Args:
         env: Worlds with a head camera, as many as seeds.
-        seeds: Episode seeds.
         prim: The target.
 
     Returns:

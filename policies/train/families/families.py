@@ -33,10 +33,8 @@ def build(
     """A policy with new or pretrained weights, in training mode, and its processors.
 
     Args:
-        recipe: Sizes and options.
         stats: Statistics of the training's data, of its features before normalisation. Those of
             `observation.environment_state` say the width of the task vector.
-        device: Torch device of the policy.
         weights: Name on the Hugging Face hub or a local folder (of ResNet also the file) with pretrained weights: of
             the vision encoder, of pi0.5 the whole network. None: as the recipe says.
 
@@ -52,7 +50,6 @@ def check_weights(recipe: TrainingRecipe, weights: str | Path | None = None) -> 
     """Make sure that pretrained weights are there, before anything that takes time; they are not loaded.
 
     Args:
-        recipe: Sizes and options.
         weights: As of `build`. What is on the hub and not in its cache is downloaded.
 
     Raises:

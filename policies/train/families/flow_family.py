@@ -67,12 +67,8 @@ class FlowModel(TrainableModel):
         """Make one with its encoders.
 
         Args:
-            recipe: Of the training.
             stats: As `usable_stats` returns them.
-            device: Where the policy is.
-            policy: LeRobot's.
             clip: Architecture of its encoders.
-            tokenizer: Of the instruction.
             own: Whether the encoders are in no other folder or hub, so that a checkpoint must hold them.
         """
         self.clip, self.tokenizer, self.own = clip, tokenizer, own

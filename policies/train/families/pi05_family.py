@@ -95,11 +95,7 @@ class Pi05Model(TrainableModel):
         """Make one with its tokenizer.
 
         Args:
-            recipe: Of the training.
             stats: As `usable_stats` returns them.
-            device: Where the policy is.
-            policy: LeRobot's.
-            tokenizer: Of the prompt.
             name: Where a stock LeRobot finds the tokenizer; empty where only a checkpoint has it.
         """
         self.tokenizer, self.tokenizer_name = tokenizer, name

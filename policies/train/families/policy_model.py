@@ -114,9 +114,7 @@ class TrainableModel(abc.ABC):
         """Make one with processors of the statistics.
 
         Args:
-            recipe: Of the training.
             stats: As `usable_stats` returns them.
-            device: Where the policy is.
             policy: With the features of `configuration`.
         """
         self.recipe = recipe

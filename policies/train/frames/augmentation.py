@@ -32,9 +32,7 @@ def gathered_pictures(
     sees them there.
 
     Args:
-        store: All pictures.
         rows: Rows of the samples, int64, shape [B].
-        camera: Number of the camera.
         tall: Height of the pictures that are wanted, cut about the middle of the camera's [px]; 0: its own.
         changed: Samples whose looks are changed, bool, shape [B], each at a row that has looks; None: none of them.
         shift: Most pixels by which a picture is shifted in each direction.

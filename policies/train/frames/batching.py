@@ -84,8 +84,6 @@ class BalancedOrder:
             samples: Rows at which samples may begin, int64.
             groups: Group of each, int64.
             weights: Of each group, all of which have rows.
-            seed: Of the draws.
-            device: Where the rows are wanted.
         """
         self._samples = torch.from_numpy(samples[np.argsort(groups, kind="stable")])
         self._counts = torch.from_numpy(np.bincount(groups, minlength=len(weights)))

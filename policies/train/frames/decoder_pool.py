@@ -179,7 +179,6 @@ class DecoderPool:
         """Decode episodes; what is not read to its end is broken off, and the processes with it: threads decode then.
 
         Args:
-            films: The episodes.
             top: Rows above that are cut off [px].
             bottom: Rows below that are cut off [px].
             put: Is given the pictures, in any order, by this thread or, where threads decode, by any.

@@ -56,7 +56,6 @@ class EpisodeDecoder:
         """Decode as many pictures as there is room for.
 
         Args:
-            path: The film.
             first: Number of the first one in it.
             pictures: Where they are wanted without the rows that are cut off, uint8, shape [N, rows, width, 3].
             every: Pictures of the film from one to the next.
@@ -107,7 +106,6 @@ def mapped(fd: int, process: int, slot: int) -> mmap.mmap:
 
     Args:
         fd: File of the memory of all processes.
-        process: Number of the process.
         slot: Bytes of a slot, whole pages.
     """
     return mmap.mmap(fd, SLOTS * slot, offset=process * SLOTS * slot)

@@ -112,7 +112,6 @@ def read_rows(root: Path, labels: str, cameras: Sequence[str] = (FRONT,)) -> Dat
     """Read the rows of a dataset.
 
     Args:
-        root: Its folder.
         labels: Protocol in which the actions are wanted, `v3.1` or `v4`.
         cameras: Cameras whose pictures are wanted, by their names in recordings.
 

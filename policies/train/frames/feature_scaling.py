@@ -87,7 +87,6 @@ def scalings(modes: Mapping[str, str], stats: Stats, device: torch.device) -> di
     Args:
         modes: Feature → name of LeRobot's `NormalizationMode`.
         stats: As `usable_stats` returns them.
-        device: Where the results are.
 
     Raises:
         InputError: A mode is not known, or its statistics are missing.

@@ -201,7 +201,6 @@ def load_frames(
 
     Args:
         datasets: Read with `read_rows`; their pictures must have one size.
-        device: Where the rows are wanted.
         hold_out: Last episodes of each dataset that are held out.
         every: Rows from one picture of an episode to the next.
         middle: Height of the part about the middle of the pictures that is wanted alone, where a pad is around it [px];

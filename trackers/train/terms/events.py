@@ -181,7 +181,6 @@ def push(env: TrackerEnv, mask: torch.Tensor, every: float, planar: float, verti
     """A kick of the base, every `every` seconds on average: its velocity jumps.
 
     Args:
-        env: The worlds.
         mask: Worlds that may be pushed.
         every: Mean time between two pushes of the same world [s].
         planar: Largest jump over the ground, in any direction [m/s].
