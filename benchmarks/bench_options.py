@@ -16,6 +16,7 @@ __all__ = [
     "AuditTimeOptions",
     "DeviceOptions",
     "HonestOptions",
+    "MistakesOptions",
     "ProcessorOptions",
     "PeerOptions",
     "PlainBenchOptions",
@@ -256,3 +257,13 @@ class GradientBenchOptions(PlainBenchOptions):
     """Episodes of each task that are replayed."""
     step: float = 1e-6
     """Step of the differences of a tick or a closed loop."""
+
+
+@dataclass(frozen=True)
+class MistakesOptions(PlainBenchOptions):
+    """Plant mistakes of sign, order, frame and scale in a tracker on the CPU, and count those that `--stand` finds."""
+
+    tracker: str = "twist2"
+    """Tracker with a front end, by name."""
+    checkpoint: str | None = None
+    """Its weights; those that it comes with when none are named."""

@@ -158,6 +158,23 @@ def test_metrics_of_one_name_are_refused(tmp_path, capsys):
     assert "--recorder nope: unknown recorder; known are none: no package is installed that offers one" in said
 
 
+def test_a_metric_that_two_recorders_give_is_refused(tmp_path, capsys):
+    """A recorder that would overwrite another one's metric, even with the same number, stops the run by both names."""
+
+    class First(Recorder):
+        def finish(self, env, world, result):
+            result.extra["speed"] = 1.0
+
+    class Second(Recorder):
+        def finish(self, env, world, result):
+            result.extra |= {"height": 2.0, "speed": 1.0}
+
+    assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=lambda env: [First(), Second()])) == 2
+    said = capsys.readouterr().err
+    assert "error: metric speed: is the name of" in said and "<locals>.First and of" in said
+    assert "<locals>.Second; rename one" in said and journal(tmp_path / "a") == {}
+
+
 def test_a_metric_of_any_size_has_its_figures(tmp_path):
     """A metric that a float just holds is in the tables, though its sum and its square are too large."""
     big = sys.float_info.max
