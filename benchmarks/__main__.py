@@ -75,7 +75,7 @@ BENCHES = {
     "devices": Item(DeviceOptions, "audits.device_ticks:device_figures", "ticks and pictures of engine warp, replayed"),
     "honest": Item(HonestOptions, "audits.honest_folders:honest_figures", "honest results that an audit accuses: none"),
     "mistakes": Item(
-        MistakesOptions, "audits.planted_mistakes:mistake_figures", "mistakes in a tracker that --stand finds"
+        MistakesOptions, "audits.planted_mistakes:mistake_figures", "a tracker's mistakes that --stand finds"
     ),
     "tests": Item(PlainBenchOptions, "single_figures:suite_times", "the test suite, kernels cached and not"),
 }

@@ -67,7 +67,7 @@ SHOWN: dict[str, Callable[[TrackerCommand, RobotState], Seen]] = {
     "command: yaw rate of the other sign": lambda c, s: (_mimic(c, "yaw_rate", torch.neg), s),
     "command: roll and pitch of the other sign": lambda c, s: (_mimic(c, "roll_pitch", torch.neg), s),
 }
-"""What the front end is shown instead of command and state."""
+"""Mistake → command and state that the front end is shown instead."""
 SCALES = {"action scale × 0.5": 0.5, "action scale × 2": 2.0, "action scale × -1": -1.0}
 POSE = "default pose of the other sign"
 
