@@ -13,7 +13,7 @@ from arena_newton.errors import InputError
 from arena_newton.files.stored_json import is_name
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 
-__all__ = ["Metric", "check", "check_names", "get", "names", "register", "unregister"]
+__all__ = ["Metric", "check", "check_names", "finish", "get", "names", "register", "unregister"]
 
 Fold = Literal["highest", "lowest", "mean", "total", "last"]
 FOLDS = get_args(Fold)
@@ -42,11 +42,33 @@ def check_names(recorders: Sequence[Recorder]) -> None:
     Raises:
         InputError: Two have the same; the message names their classes.
     """
-    found: dict[str, Metric] = {}
+    found: dict[str, Recorder] = {}
     for metric in (one for one in recorders if isinstance(one, Metric)):
-        if (other := found.setdefault(metric.name, metric)) is not metric:
-            kinds = [f"{kind.__module__}.{kind.__qualname__}" for kind in (type(other), type(metric))]
-            raise InputError(f"metric {metric.name}: is the name of {kinds[0]} and of {kinds[1]}; rename one of them")
+        _claim(metric.name, metric, found)
+
+
+def finish(recorders: Sequence[Recorder], env: World, world: int, result: EpisodeResult) -> None:
+    """Tell recorders that an episode ended, each of which sees its own metrics alone in `result.extra`; then all are.
+
+    Raises:
+        InputError: Two give metrics of one name; the message names their classes.
+    """
+    found: dict[str, float] = {}
+    owners: dict[str, Recorder] = {}
+    for one in recorders:
+        result.extra = {}
+        one.finish(env, world, result)
+        for name in result.extra:
+            _claim(name, one, owners)
+        found |= result.extra
+    result.extra = found
+
+
+def _claim(name: str, recorder: Recorder, owners: dict[str, Recorder]) -> None:
+    """Note the recorder of a metric, or refuse a second one."""
+    if (other := owners.setdefault(name, recorder)) is not recorder:
+        kinds = [f"{kind.__module__}.{kind.__qualname__}" for kind in (type(other), type(recorder))]
+        raise InputError(f"metric {name}: is the name of {kinds[0]} and of {kinds[1]}; rename one of them")
 
 
 class Metric(Recorder):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from arena_newton import recorders
 from arena_newton.errors import InputError
 from arena_newton.files.text import counted
 from arena_newton.interfaces import (
@@ -289,7 +290,6 @@ class Rollout:
             events=verdict.events,
         )
         self._results[running.index] = result
-        for one in self.recorders:
-            one.finish(env, world, result)
+        recorders.finish(self.recorders, env, world, result)
         if self.on_finish is not None:
             self.on_finish(result)

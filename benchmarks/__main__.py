@@ -22,6 +22,7 @@ from benchmarks.bench_options import (
     ForgeryOptions,
     GradientBenchOptions,
     HonestOptions,
+    MistakesOptions,
     PeerOptions,
     PlainBenchOptions,
     PolicyBenchOptions,
@@ -73,6 +74,9 @@ BENCHES = {
     "processors": Item(ProcessorOptions, "audits.processors:processor_figures", "replays with other instructions"),
     "devices": Item(DeviceOptions, "audits.device_ticks:device_figures", "ticks and pictures of engine warp, replayed"),
     "honest": Item(HonestOptions, "audits.honest_folders:honest_figures", "honest results that an audit accuses: none"),
+    "mistakes": Item(
+        MistakesOptions, "audits.planted_mistakes:mistake_figures", "a tracker's mistakes that --stand finds"
+    ),
     "tests": Item(PlainBenchOptions, "single_figures:suite_times", "the test suite, kernels cached and not"),
 }
 """Benches by name."""

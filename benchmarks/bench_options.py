@@ -16,6 +16,7 @@ __all__ = [
     "AuditTimeOptions",
     "DeviceOptions",
     "HonestOptions",
+    "MistakesOptions",
     "ProcessorOptions",
     "PeerOptions",
     "PlainBenchOptions",
@@ -214,8 +215,8 @@ class ProcessorOptions(PlainBenchOptions):
 class DeviceOptions(PlainBenchOptions):
     """Record experts on engine warp, and measure what an audit on engine mujoco allows for: ticks and pictures."""
 
-    device: Device[str] = "cpu"
-    """Device of engine warp: cuda:0, or cpu, which takes minutes."""
+    device: Device[str] | None = None
+    """Device of engine warp: the best there is when none is named; on the CPU it takes minutes."""
     tasks: Several[str] = ("football", "pp_box")
     """Tasks."""
     episodes: int = field(default=2, metadata=bounds(1, 10_000))
@@ -256,3 +257,13 @@ class GradientBenchOptions(PlainBenchOptions):
     """Episodes of each task that are replayed."""
     step: float = 1e-6
     """Step of the differences of a tick or a closed loop."""
+
+
+@dataclass(frozen=True)
+class MistakesOptions(PlainBenchOptions):
+    """Plant mistakes of sign, order, frame and scale in a tracker on the CPU, and count those that `--stand` finds."""
+
+    tracker: str = "twist2"
+    """Tracker with a front end, by name."""
+    checkpoint: str | None = None
+    """Its weights; those that it comes with when none are named."""

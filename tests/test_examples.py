@@ -27,7 +27,7 @@ SHORT: dict[str, list[str]] = {
     "drive_by_code": ["--max-steps", "55"],
     "finetune": ["--seconds", "0.1", "--max-steps", "4"],
     "fit_motion": ["--iterations", "2", "--plays", "2", "--max-steps", "6"],
-    "identify": ["--windows", "2", "--iterations", "1"],
+    "identify": ["--windows", "1", "--iterations", "1"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],

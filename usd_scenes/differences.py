@@ -162,7 +162,7 @@ def _parts(stage: Usd.Stage) -> dict[str, _Part]:
     """Every prim that counts, by its path."""
     poses = UsdGeom.XformCache()
     parts: dict[str, _Part] = {}
-    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         path = str(prim.GetPath())
         robot = path == _ROBOT or path.startswith(f"{_ROBOT}/")
         values = {

@@ -9,13 +9,12 @@ import newton
 import numpy as np
 from PIL import Image, ImageDraw
 
-from arena_newton import tasks
+from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.physics.scene import Scene, load_scene, scene_path
 from arena_newton.pictures.camera import Camera, WorldLights
 from arena_newton.robot import g1
 from arena_newton.rules import modes as all_modes
-from arena_newton.rules.rule_types import LightRange
 from arena_newton.tasks.base import draw_light
 from arena_newton.usd_scenes.shapes import open_stage
 
@@ -42,7 +41,7 @@ def preview(targets: list[str], out: Path, size: int = 320, *modes: str) -> Path
         targets: Task names or scene files.
         out: PNG to write.
         size: Width of the head camera's picture [px]; the other view has the same height.
-        *modes: Some of `MODES`, or all for all of them; base when none is given.
+        *modes: Some of `MODES` or of other packages, or all for all of `MODES`; base when none is given.
 
     Returns:
         The path of the PNG.
@@ -50,9 +49,10 @@ def preview(targets: list[str], out: Path, size: int = 320, *modes: str) -> Path
     Raises:
         InputError: Unknown mode, size, or a target that is not a scene.
     """
+    known = (*MODES, *(mode for mode in all_modes.names() if mode not in all_modes.BUILT_IN))
     for mode in modes:
-        if mode != "all" and mode not in MODES:
-            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(MODES)} or all")
+        if mode not in ("all", *known):
+            raise InputError(f"--mode {mode}: unknown, choose from {', '.join(known)} or all")
     if size < 16:
         raise InputError(f"--size {size}: expected at least 16 pixels")
     height = round(size / _VIEWS[0][1])
@@ -88,8 +88,8 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
     variant = "base" if layer else _variant(target, mode)
     scene = load_scene(target, worlds=1, device="cpu", native=True, variant=variant, variant_file=layer)
     lights = WorldLights.allocate(1, scene.device, scene.stage)
-    if mode == "visual":
-        lights.set(0, draw_light(_LIGHT_SEED, LightRange()))
+    if drawn := all_modes.get(mode).light:
+        lights.set(0, draw_light(_LIGHT_SEED, drawn(rule_sets.get("paper"))))
     state = _settled(scene)
     pictures = []
     for view, aspect in _VIEWS:
@@ -100,8 +100,8 @@ def _views(target: str, height: int, mode: str) -> list[np.ndarray]:
 
 def _variant(target: str, mode: str) -> str:
     """The variant of `semantics` to load: the one that the scene selects by itself, unless asked for semantic."""
-    if mode == "semantic" or mode in all_modes.HELD_OUT:
-        return mode
+    if (own := all_modes.get(mode).scene) != "base":
+        return mode if own == "layer" else own
     stage = open_stage(scene_path(target))
     world = stage.GetPrimAtPath("/World")
     return (world.GetVariantSet("semantics").GetVariantSelection() if world else "") or "base"

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from arena_newton.cli.registry import Registry
@@ -61,6 +62,8 @@ class Mode:
     """Range from which an object's placement is drawn, of those that the rule set has or another one."""
     scene: Literal["base", "semantic", "layer"] = "base"
     """The scene itself, its semantic variant, or a layer of its own, `variants/<mode>.usda` next to the scene."""
+    layers: Path | None = None
+    """Folder with a layer `<task>.usda` of each task, instead of those next to the scenes."""
     light: Callable[[RuleSet], LightRange] | None = None
     """Range from which a distant light is drawn; None: the light of the scene."""
     dynamics: Mapping[str, Range] = field(default_factory=dict)
@@ -70,8 +73,10 @@ class Mode:
         """Check the ranges.
 
         Raises:
-            InputError: An unknown quantity, or a range that is none.
+            InputError: An unknown quantity, a range that is none, or layers of a mode that takes none.
         """
+        if self.layers is not None and self.scene != "layer":
+            raise InputError(f"mode {self.name}: has layers, but its scene is {self.scene!r}, expected 'layer'")
         for name, (low, high) in self.dynamics.items():
             if name not in QUANTITIES:
                 raise InputError(f"mode {self.name}: {name} is none of {', '.join(QUANTITIES)}")

@@ -417,9 +417,9 @@ class TaskSpec:
         Raises:
             InputError: The task has no such layer.
         """
-        if modes.get(mode).scene != "layer":
+        if (own := modes.get(mode)).scene != "layer":
             return None
-        path = self.layer.parent / "variants" / f"{mode}.usda"
+        path = own.layers / f"{self.name}.usda" if own.layers else self.layer.parent / "variants" / f"{mode}.usda"
         if not path.is_file():
             raise InputError(f"--mode {mode}: task {self.name} has no {path}")
         return path

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from arena_newton.physics.scene import Scene
     from arena_newton.rules.rule_types import RuleSet
 
-__all__ = ["Condition", "ConditionsJudge", "Judge", "above", "bounding_box", "links", "near"]
+__all__ = ["Condition", "ConditionsJudge", "Judge", "above", "below", "bounding_box", "links", "near"]
 __all__ += ["origin", "palms", "slow", "standing", "top"]
 
 _ABOVE = 50.0
-"""Half extent of the box that represents everything above a height [m]: larger than any scene."""
+"""Half extent of the box that represents everything above or below a height [m]: larger than any scene."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,11 @@ def above(point: BodyFrame, height: float) -> Condition:
     """A point is higher than `height` [m]."""
     half = (_ABOVE, _ABOVE, _ABOVE)
     return Condition("near", 0.0, (point,), (Marker(0, (0.0, 0.0, height + _ABOVE), IDENTITY, half),))
+
+
+def below(point: BodyFrame, height: float) -> Condition:
+    """A point is lower than `height` [m], such as the top of a thing that was knocked over."""
+    return near([point], Marker(0, (0.0, 0.0, height - _ABOVE), IDENTITY, (_ABOVE, _ABOVE, _ABOVE)), 0.0)
 
 
 def slow(scene: Scene, prim: str, limit: float) -> Condition:

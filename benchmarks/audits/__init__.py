@@ -1,1 +1,1 @@
-"""Measurements of audits: what they find in forged folders, and what they say of honest ones."""
+"""Measurements of checks: what audits and `--stand` find of planted faults, and what they say of honest results."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import tempfile
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.eval.commands.audit import AuditOptions
 from arena_newton.eval.commands.run import run as evaluate
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.physics.devices import torch_device
 from arena_newton.pictures.settings import CameraConfig
 from benchmarks.bench_options import DeviceOptions
 
@@ -27,6 +29,7 @@ __all__ = ["device_figures"]
 
 def device_figures(options: DeviceOptions) -> Iterator[BenchFigure]:
     """Largest differences of the ticks of experts' episodes, and of their first pictures."""
+    options = dataclasses.replace(options, device=options.device or str(torch_device(None)))
     for task in options.tasks:
         with tempfile.TemporaryDirectory() as work:
             yield from _ticks(task, Path(work) / "run", options)
@@ -73,7 +76,7 @@ def _pictures(task: str, options: DeviceOptions) -> Iterator[BenchFigure]:
     yield BenchFigure(f"{task}: bytes of pictures that differ", None, "%", True, part, note)
 
 
-def _drawn(task: str, engine: str, device: str, worlds: int) -> torch.Tensor:
+def _drawn(task: str, engine: str, device: str | None, worlds: int) -> torch.Tensor:
     """First pictures of a policy's head camera."""
     camera = CameraConfig(width=224, height=224)
     env = ArenaEnv(task, worlds=worlds, tracker=trackers.get("twist2"), engine=engine, device=device, camera=camera)

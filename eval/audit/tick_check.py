@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 
@@ -15,7 +16,7 @@ from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 
-__all__ = ["EPISODE", "SECOND", "START", "StatesAgain", "TickDifferences"]
+__all__ = ["EPISODE", "SECOND", "START", "StatesAgain", "TickDifferences", "surface_radii"]
 
 EPISODE = "episode"
 """Name of the recording of an episode among its media."""
@@ -59,6 +60,21 @@ def _largest(differences: list[np.ndarray], ticks: int) -> np.ndarray:
     return largest
 
 
+def surface_radii(model: mujoco.MjModel) -> np.ndarray:
+    """Factors of degrees of freedom, shape [nv]: of a lone body's spin its farthest surface [m], else 1.
+
+    A kick pinches the ball between foot and floor; engines agree on its speed then, and not on its spin.
+    """
+    factors = np.ones(model.nv)
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        first, body = model.jnt_dofadr[joint], model.jnt_bodyid[joint]
+        if np.count_nonzero(model.dof_treeid == model.dof_treeid[first]) == 6:
+            shapes = model.body_rootid[model.geom_bodyid] == body
+            reach = np.linalg.norm(model.geom_pos[shapes], axis=1) + model.geom_rbound[shapes]
+            factors[first + 3 : first + 6] = reach.max(initial=0.0) or 1.0
+    return factors
+
+
 @dataclass
 class _Recorded:
     """Recorded states of an episode."""
@@ -68,6 +84,8 @@ class _Recorded:
     """Before each tick and at the end, shape [ticks + 1, nq]."""
     velocities: np.ndarray
     """Before each tick, shape [ticks, nv]."""
+    radii: np.ndarray
+    """Radii of spin, shape [nv] (`surface_radii`)."""
 
 
 class StatesAgain(Recorder):
@@ -91,7 +109,7 @@ class StatesAgain(Recorder):
         velocities = file.array("arena_qvel", len(positions), model.nv)
         if not len(velocities):
             raise InputError(f"{file.path}: arena_qvel holds no tick")
-        self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities)
+        self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities, surface_radii(model))
         self.differences[episode.index] = TickDifferences()
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
@@ -116,7 +134,7 @@ class StatesAgain(Recorder):
         env.physics.put(world, mine.positions[tick], mine.velocities[last])
         if found.states:
             found.positions.append(bodies - given)
-            found.velocities += [mine.velocities[tick] - moving] if tick == last else []
+            found.velocities += [(mine.velocities[tick] - moving) * mine.radii] if tick == last else []
         else:
             found.first = float(np.abs(bodies - given).max())
         found.states += 1

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from arena_newton.eval.loop import loop_report
 from arena_newton.eval.loop.loop_options import LoopOptions
 from arena_newton.eval.loop.loop_report import DATASET, EVALUATION, RECORDINGS, TRAINING
 from arena_newton.eval.loop.loop_requirements import check_disk, check_folder, check_libraries, recorded_bytes
-from arena_newton.eval.loop.stage_state import succeeded, trained
+from arena_newton.eval.loop.stage_state import continued, succeeded, trained
 from arena_newton.eval.plan.config import recorded_cameras, recording_run, resolve
 from arena_newton.eval.plan.episode_plan import PROTOCOL_SEEDS
 from arena_newton.eval.plan.options import RecordOptions, RunOptions
@@ -268,12 +267,7 @@ class _Loop:
         return lerobot_dataset.build([recordings], BuildOptions(out=self.out / DATASET))
 
     def _train(self) -> int:
-        options, folder = _training(self.options, self.out), self.out / TRAINING
-        if (folder / "checkpoints" / "last").exists():
-            options = PolicyTrainOptions(resume=folder, device=options.device)  # the rest is the training's own
-        elif folder.exists():  # killed before its first checkpoint
-            shutil.rmtree(folder)
-        train(options)
+        train(continued(_training(self.options, self.out)))
         return 0
 
     def _evaluate(self) -> int:

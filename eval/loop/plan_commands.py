@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +17,7 @@ from arena_newton import tasks
 from arena_newton.cli.flags import words
 from arena_newton.data.datasets.data_options import BuildOptions
 from arena_newton.eval.loop.plan_file import LoopPlan, PlanRow, policy_name, suite_text
-from arena_newton.eval.loop.stage_state import played, succeeded, trained
+from arena_newton.eval.loop.stage_state import continued, played, succeeded, trained
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.policies.train.policy_options import PolicyTrainOptions
@@ -222,13 +221,9 @@ def _recorded(flags: Sequence[str], folder: Path) -> list[str]:
 
 def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: int, gpus: int) -> list[str]:
     """Begin a training, or go on with it."""
-    folder = options.out
-    assert folder is not None
     jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // max(1, gpus))
-    if (folder / "checkpoints" / "last").exists():
-        options = PolicyTrainOptions(resume=folder, device=options.device, compile=options.compile)
-    else:
-        shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint
+    options = continued(options)
+    if options.resume is None:
         options = dataclasses.replace(options, minutes=0.0 if options.steps else minutes())
     command = [TRAIN, *words(dataclasses.replace(options, jobs=jobs, quiet=True))]
     if each == 1:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from arena_newton.errors import InputError
 from arena_newton.eval.records.document import read_document
 from arena_newton.eval.suites.suite_records import read_suite
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
 from arena_newton.policies.train.training_state import TrainingProgress, last_checkpoint
 
-__all__ = ["played", "succeeded", "trained"]
+__all__ = ["continued", "played", "succeeded", "trained"]
 
 
 def succeeded(folder: Path) -> bool:
@@ -29,6 +31,16 @@ def trained(folder: Path) -> bool:
     except InputError:  # and the training with its own
         return False
     return 0 < progress.steps <= progress.step
+
+
+def continued(options: PolicyTrainOptions) -> PolicyTrainOptions:
+    """Flags that go on with a training from its last checkpoint; one that was killed before its first begins anew."""
+    folder = options.out
+    assert folder is not None
+    if (folder / "checkpoints" / "last").exists():  # the rest is the training's own
+        return PolicyTrainOptions(resume=folder, device=options.device, compile=options.compile)
+    shutil.rmtree(folder, ignore_errors=True)
+    return options
 
 
 def played(suites: Sequence[Path], policies: set[str]) -> bool:

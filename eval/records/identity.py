@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import arena_newton
+from arena_newton import tasks as all_tasks
 from arena_newton.errors import InputError
 from arena_newton.rules import modes as all_modes
 
@@ -246,12 +247,20 @@ def foreign_task(spec: TaskSpec, modes: Collection[str] = ()) -> JsonObject:
 
 
 def mode_facts(name: str, rules: RuleSet, tasks: Collection[str]) -> JsonObject:
-    """Hashes of a mode's ranges for some tasks, and of the package of its functions, unless the rules hold them all."""
+    """Hashes of a mode's ranges for some tasks, and of the package of its functions, unless the rules hold them all.
+
+    So do layers in a folder of its own, with all that they name.
+    """
     mode = all_modes.get(name)
     if mode.ruled:
         return {}
     codes = {code for part in (mode.placements, mode.light) if part and (code := own_code(part)) is not None}
-    return {"ranges": mode.hash_for(rules, tasks)} | ({"code": config_hash(sorted(codes))} if codes else {})
+    facts: JsonObject = {"ranges": mode.hash_for(rules, tasks)}
+    facts |= {"code": config_hash(sorted(codes))} if codes else {}
+    if mode.layers is not None:
+        layers = {task: all_tasks.get(task).own_layer(name) for task in sorted(tasks)}
+        facts["layers"] = {task: layers_hash(layer) for task, layer in layers.items() if layer is not None}
+    return facts
 
 
 def own_code(part: object) -> str | None:

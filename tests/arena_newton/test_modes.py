@@ -14,6 +14,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
+from arena_newton.eval.records.identity import mode_facts
 from arena_newton.physics.dynamics import Delay
 from arena_newton.rules import modes
 from arena_newton.rules.modes import DYNAMICS, QUANTITIES, Mode
@@ -52,6 +53,31 @@ def test_a_mode_of_another_package_is_played_and_hashed(offered):
     assert "mode_facts" not in identity("base", "execution", "semantic", "visual")
     facts = identity("base", "wet", DYNAMICS)["mode_facts"]
     assert set(facts) == {"wet", DYNAMICS} and "code" in facts["wet"] and "code" not in facts[DYNAMICS]
+
+
+def test_a_mode_of_another_package_brings_layers(monkeypatch, tmp_path):
+    """Its layer of a task opens in place of the scene and counts by content; a task without one refuses the mode."""
+    layer = tmp_path / "football.usda"
+    head = (
+        '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"\n'
+    )
+    layer.write_text(f"{head}    subLayers = [@arena_newton/usd_scenes/football/scene.usda@]\n)\n")
+    night = Mode(name="night", sentence="it is dark", scene="layer", layers=tmp_path)
+    monkeypatch.setitem(modes._MODES._registered, "night", night)
+    spec = tasks.get("football")
+    assert (spec.own_layer("night"), spec.scene_name("night", PAPER)) == (layer, "night")
+    env = ArenaEnv("football", tracker=trackers.get("pd"), worlds=1, engine="mujoco", threads=1, mode="night")
+    assert env.scene.path == layer
+    env.close()
+    before = mode_facts("night", PAPER, ("football",))
+    layer.write_text(layer.read_text() + 'over "World"\n{\n}\n')
+    after = mode_facts("night", PAPER, ("football",))
+    assert before["ranges"] == after["ranges"] and before["layers"].keys() == {"football"}
+    assert before["layers"] != after["layers"]
+    with pytest.raises(InputError, match=r"--mode night: task boxing has no .*boxing\.usda"):
+        mode_facts("night", PAPER, ("boxing",))
+    with pytest.raises(InputError, match="mode wet: has layers, but its scene is 'base', expected 'layer'"):
+        dataclasses.replace(WET, layers=tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -140,19 +140,42 @@ def test_double_desk_released_has_a_floor(device, twin):
     np.testing.assert_allclose(margin, [-0.001, 0.001], atol=2e-6)
 
 
-FREE = np.zeros(WORLDS, np.float32)
-"""No robot touches the box."""
-PAPER_BOX = {
-    "box_qvel_adr": 4,
-    "height_tolerance": 0.06,
-    "max_speed": 0.05,
-    "tick": 0.02,
-}
-
-
-def _box(stage, twin):
+def _box(twin):
     """The box to move: body 5, its origin at its centre."""
-    return stage.boxes(twin.Marker(5, (0, 0, 0), UPRIGHT, (0.105, 0.105, 0.105)))
+    return twin.Marker(5, (0, 0, 0), UPRIGHT, (0.105, 0.105, 0.105))
+
+
+def _paper(stage, box, decks, qvel=None, force=None, tick=0.02, confirm_ticks=10):
+    """Success, margin and counter under `paper` of a box that rests and that no robot touches by default."""
+    return stage.judge(
+        success.launch_pp_box_paper,
+        stage.xpos,
+        stage.xquat,
+        np.zeros((stage.worlds, 10), np.float32) if qvel is None else qvel,
+        np.zeros(stage.worlds, np.float32) if force is None else force,
+        box=stage.boxes(box),
+        decks=stage.boxes(*decks),
+        box_qvel_adr=4,
+        height_tolerance=0.06,
+        max_speed=0.05,
+        tick=tick,
+        confirm_ticks=confirm_ticks,
+        outputs=("success", "margin", "counter"),
+    )
+
+
+def _released(stage, twin, decks):
+    """Success and margin of the box on the middle deck under `released`."""
+    return stage.judge(
+        success.launch_pp_box_released,
+        stage.xpos,
+        stage.xquat,
+        box=stage.boxes(_box(twin)),
+        decks=stage.boxes(*decks),
+        deck=1,
+        plane_below=0.02,
+        height_tolerance=0.06,
+    )
 
 
 def _decks(twin, body=3):
@@ -170,18 +193,7 @@ def test_pp_box_paper_random(device, twin):
     qvel = np.zeros((WORLDS, 10), np.float32)
     qvel[:, 4:7] = stage.rng.normal(scale=0.02, size=(WORLDS, 3))
     decks = _decks(twin)
-    ok, margin, counter = stage.judge(
-        success.launch_pp_box_paper,
-        stage.xpos,
-        stage.xquat,
-        qvel,
-        FREE,
-        box=_box(stage, twin),
-        decks=stage.boxes(*decks),
-        confirm_ticks=1,
-        outputs=("success", "margin", "counter"),
-        **PAPER_BOX | {"tick": 0.2},
-    )
+    ok, margin, counter = _paper(stage, _box(twin), decks, qvel, tick=0.2, confirm_ticks=1)
     p = stage.xpos[:, 5].astype(np.float64)
     bottom = twin.world_box(p, twin.matrix(stage.xquat[:, 5]), (0.105,) * 3)[0][:, 2]
     slacks = []
@@ -222,18 +234,7 @@ def test_pp_box_paper_thresholds(device, twin, centre, speed, good):
     qvel[0, 4:7] = np.array([0.6, 0.0, -0.8]) * speed
     verdicts = []
     for _ in range(11):
-        ok, margin, _ = stage.judge(
-            success.launch_pp_box_paper,
-            stage.xpos,
-            stage.xquat,
-            qvel,
-            FREE[:1],
-            box=_box(stage, twin),
-            decks=stage.boxes(*_decks(twin)),
-            confirm_ticks=10,
-            outputs=("success", "margin", "counter"),
-            **PAPER_BOX,
-        )
+        ok, margin, _ = _paper(stage, _box(twin), _decks(twin), qvel)
         verdicts.append(int(ok[0]))
         assert (margin[0] >= 0) == bool(good)
     assert verdicts == ([0] * 9 + [1] * 2 if good else [0] * 11)
@@ -245,18 +246,7 @@ def test_pp_box_paper_counter_restarts(device, twin):
     stage.xpos[0, 3], stage.xpos[0, 5] = 0, (0.1, 0, 0.753)
     for t in range(19):
         qvel = np.full((1, 10), 1.0 if t == 9 else 0.0, np.float32)
-        ok, _, counter = stage.judge(
-            success.launch_pp_box_paper,
-            stage.xpos,
-            stage.xquat,
-            qvel,
-            FREE[:1],
-            box=_box(stage, twin),
-            decks=stage.boxes(*_decks(twin)),
-            confirm_ticks=10,
-            outputs=("success", "margin", "counter"),
-            **PAPER_BOX,
-        )
+        ok, _, counter = _paper(stage, _box(twin), _decks(twin), qvel)
         assert not ok[0] and counter[0] == (t + 1 if t < 9 else t - 9)
 
 
@@ -267,18 +257,7 @@ def test_pp_box_paper_asks_for_open_hands(device, twin):
     counts = []
     for t in range(21):
         force = np.array([0.001 if t < 4 else 10.0 if t == 10 else 0.0], np.float32)
-        ok, margin, counter = stage.judge(
-            success.launch_pp_box_paper,
-            stage.xpos,
-            stage.xquat,
-            np.zeros((1, 10), np.float32),
-            force,
-            box=_box(stage, twin),
-            decks=stage.boxes(*_decks(twin)),
-            confirm_ticks=10,
-            outputs=("success", "margin", "counter"),
-            **PAPER_BOX,
-        )
+        ok, margin, counter = _paper(stage, _box(twin), _decks(twin), force=force)
         counts.append(int(counter[0]))
         assert ok[0] == (t == 20)
         np.testing.assert_allclose(min(margin[0], 0.0), -force[0] / 500.0, atol=1e-9)
@@ -290,16 +269,7 @@ def test_pp_box_released_random(device, twin):
     stage = twin.Stage(device, spread=0.8, quats=twin.random_quats(np.random.default_rng(4), WORLDS, BODIES, tilt=0.1))
     stage.xpos[:, 5, 2] = 0.753 + stage.rng.uniform(-0.08, 0.08, WORLDS)
     decks = _decks(twin)
-    ok, margin = stage.judge(
-        success.launch_pp_box_released,
-        stage.xpos,
-        stage.xquat,
-        box=_box(stage, twin),
-        decks=stage.boxes(*decks),
-        deck=1,
-        plane_below=0.02,
-        height_tolerance=0.06,
-    )
+    ok, margin = _released(stage, twin, decks)
     low, high = twin.world_box(*twin.box_pose(decks[1], stage.xpos, stage.xquat), decks[1].half)
     p = stage.xpos[:, 5].astype(np.float64)
     span = twin.inside(p[:, :2], low[:, :2] + 0.105, high[:, :2] - 0.105)
@@ -325,16 +295,7 @@ def test_pp_box_released_thresholds(device, twin, centre, good):
     stage = twin.Stage(device, worlds=1)
     stage.xpos[0, 3], stage.xpos[0, 5] = 0, centre
     decks = [twin.Marker(3, (0, 0, h), UPRIGHT, (0.95, 0.3, 0.02)) for h in (0.15, 0.648, 1.16)]
-    ok, _ = stage.judge(
-        success.launch_pp_box_released,
-        stage.xpos,
-        stage.xquat,
-        box=_box(stage, twin),
-        decks=stage.boxes(*decks),
-        deck=1,
-        plane_below=0.02,
-        height_tolerance=0.06,
-    )
+    ok, _ = _released(stage, twin, decks)
     assert ok[0] == good
 
 
@@ -344,18 +305,7 @@ def test_pp_box_of_another_origin_and_turn(device, twin):
     stage.xquat[:, 3], stage.xpos[:, 3] = UPRIGHT, 0
     stage.xpos[:, 5, 2] = 0.75 + stage.rng.uniform(-0.1, 0.1, WORLDS)
     decks, box = _decks(twin), twin.Marker(5, (0.02, -0.03, 0.1), (0.95, 0.1, 0, 0.2), (0.2, 0.1, 0.06))
-    ok, margin, _ = stage.judge(
-        success.launch_pp_box_paper,
-        stage.xpos,
-        stage.xquat,
-        np.zeros((WORLDS, 10), np.float32),
-        FREE,
-        box=stage.boxes(box),
-        decks=stage.boxes(*decks),
-        confirm_ticks=1,
-        outputs=("success", "margin", "counter"),
-        **PAPER_BOX | {"tick": 9.0},
-    )
+    ok, margin, _ = _paper(stage, box, decks, tick=9.0, confirm_ticks=1)
     centre, turn = twin.box_pose(box, stage.xpos, stage.xquat)
     bottom = twin.world_box(centre, turn, box.half)[0][:, 2]
     slacks = []

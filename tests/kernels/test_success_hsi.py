@@ -9,6 +9,7 @@ from arena_newton.kernels.rules import success
 WORLDS, BODIES = 400, 8
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 STAND = {"stand_height": 0.45, "stand_up": 0.60}
+FEET = [1, 2, 3, 4]
 
 
 def _stand(stage, twin):
@@ -22,16 +23,12 @@ def _lean(stage, twin, tilt=1.0):
     stage.qpos[:, 5] = stage.rng.uniform(0.4, 0.8, stage.worlds)
 
 
-def test_open_door_paper_random(device, twin):
-    """The root is measured in the doorway's frame; standing is the fourth and fifth slack."""
-    quats = twin.random_quats(np.random.default_rng(5), WORLDS, BODIES, tilt=0.05)
-    stage = twin.Stage(device, quats=quats)
-    _lean(stage, twin)
-    doorway = twin.Marker(2, (0.05, 0.0, 1.0), (0.9, 0.0, 0.0, 0.3), (0.5, 0.1, 1.0))
-    ok, margin = stage.judge(
+def _through_door(stage, doorway):
+    """Success and margin of OpenDoor under `paper`."""
+    return stage.judge(
         success.launch_open_door_paper,
         stage.xpos,
-        quats,
+        stage.xquat,
         stage.qpos,
         root_qpos_adr=3,
         doorway=stage.boxes(doorway),
@@ -39,6 +36,66 @@ def test_open_door_paper_random(device, twin):
         min_y=0.02,
         **STAND,
     )
+
+
+def _sits(stage, force, **options):
+    """Success, margin and counter of SitSofa under `paper`."""
+    options |= {"root_qpos_adr": 3, "min_force": 50.0, "max_root_z": 0.62}
+    outputs = ("success", "margin", "counter")
+    return stage.judge(success.launch_sit_sofa_paper, stage.qpos, force, outputs=outputs, **options)
+
+
+def _in_seat(stage, force, bodies, seat):
+    """Success and margin of SitSofa under `released`."""
+    return stage.judge(
+        success.launch_sit_sofa_released,
+        stage.xpos,
+        stage.xquat,
+        force,
+        bodies=stage.up(bodies, wp.int32),
+        seat=stage.boxes(seat),
+        below=0.10,
+        above=0.35,
+        min_force=5.0,
+    )
+
+
+def _punches(stage, palms, offsets, target, min_radius):
+    """Success and margin of Boxing."""
+    return stage.judge(
+        success.launch_boxing,
+        stage.xpos,
+        stage.xquat,
+        palm_body=stage.up(palms, wp.int32),
+        palm_offset=wp.array(offsets, dtype=wp.vec3, device=stage.device),
+        target=stage.boxes(target),
+        min_radius=min_radius,
+        pad=0.08,
+    )
+
+
+def _in_zone(stage, zone, round_zone=False):
+    """Success and margin of VisNavi; the feet are bodies 1 to 4."""
+    return stage.judge(
+        success.launch_vis_navi,
+        stage.xpos,
+        stage.xquat,
+        stage.qpos,
+        root_qpos_adr=3,
+        feet=stage.up(FEET, wp.int32),
+        zone=stage.boxes(zone),
+        round_zone=round_zone,
+        **STAND,
+    )
+
+
+def test_open_door_paper_random(device, twin):
+    """The root is measured in the doorway's frame; standing is the fourth and fifth slack."""
+    quats = twin.random_quats(np.random.default_rng(5), WORLDS, BODIES, tilt=0.05)
+    stage = twin.Stage(device, quats=quats)
+    _lean(stage, twin)
+    doorway = twin.Marker(2, (0.05, 0.0, 1.0), (0.9, 0.0, 0.0, 0.3), (0.5, 0.1, 1.0))
+    ok, margin = _through_door(stage, doorway)
     centre, r = twin.box_pose(doorway, stage.xpos, quats)
     local = np.einsum("wij,wi->wj", r, stage.qpos[:, 3:6] - centre)
     expected = np.min([0.55 - np.abs(local[:, 0]), local[:, 1] - 0.02, _stand(stage, twin)], axis=0)
@@ -66,17 +123,7 @@ def test_open_door_paper_thresholds(device, twin, root, tilt_deg, good):
     stage.xpos[0, 2] = (-1.6, 2.3, 0)
     half = np.radians(tilt_deg) / 2
     stage.qpos[0, 3:10] = (*root, np.cos(half), 0, np.sin(half), 0)
-    ok, margin = stage.judge(
-        success.launch_open_door_paper,
-        stage.xpos,
-        stage.xquat,
-        stage.qpos,
-        root_qpos_adr=3,
-        doorway=stage.boxes(twin.Marker(2, (0, 0, 1), UPRIGHT, (0.5, 0.1, 1))),
-        half_width=0.55,
-        min_y=0.02,
-        **STAND,
-    )
+    ok, margin = _through_door(stage, twin.Marker(2, (0, 0, 1), UPRIGHT, (0.5, 0.1, 1)))
     assert ok[0] == good and (margin[0] >= 0) == bool(good)
 
 
@@ -116,16 +163,7 @@ def test_sit_sofa_paper_thresholds(device, twin, force, root_z, good):
     stage.qpos[0, 5] = root_z
     verdicts = []
     for t in range(52):
-        ok, margin, _ = stage.judge(
-            success.launch_sit_sofa_paper,
-            stage.qpos,
-            np.full(1, 0.0 if t == 26 else force, np.float32),
-            root_qpos_adr=3,
-            min_force=50.0,
-            max_root_z=0.62,
-            confirm_ticks=25,
-            outputs=("success", "margin", "counter"),
-        )
+        ok, margin, _ = _sits(stage, np.full(1, 0.0 if t == 26 else force, np.float32), confirm_ticks=25)
         verdicts.append(int(ok[0]))
         assert (margin[0] >= 0) == (bool(good) and t != 26)
     assert verdicts == ([0] * 24 + [1] * 2 + [0] * 25 + [1] if good else [0] * 52)
@@ -136,21 +174,8 @@ def test_sit_sofa_paper_margin(device, twin):
     stage = twin.Stage(device)
     stage.qpos[:, 5] = stage.rng.uniform(0.5, 0.7, WORLDS)
     force = stage.rng.uniform(0, 150, WORLDS).astype(np.float32)
-    ok, margin, _ = stage.judge(
-        success.launch_sit_sofa_paper,
-        stage.qpos,
-        force,
-        root_qpos_adr=3,
-        min_force=50.0,
-        max_root_z=0.62,
-        confirm_ticks=1,
-        stiffness=400.0,
-        outputs=("success", "margin", "counter"),
-    )
+    ok, margin, _ = _sits(stage, force, confirm_ticks=1, stiffness=400.0)
     twin.check(ok, margin, np.minimum(0.62 - np.float64(stage.qpos[:, 5]), (np.float64(force) - 50) / 400))
-
-
-SEAT = {"below": 0.10, "above": 0.35, "min_force": 5.0}
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
@@ -161,15 +186,7 @@ def test_sit_sofa_released_random(device, twin, count):
     bodies = [2, 7, 1, 5][:count]
     force = (stage.rng.uniform(0, 10, (WORLDS, BODIES)) * stage.rng.integers(0, 2, (WORLDS, BODIES))).astype(np.float32)
     seat = twin.Marker(3, (0.1, 0, 0.1), (0.8, 0.1, 0.2, 0.3), (0.4, 0.3, 0.2))
-    ok, margin = stage.judge(
-        success.launch_sit_sofa_released,
-        stage.xpos,
-        quats,
-        force,
-        bodies=stage.up(bodies, wp.int32),
-        seat=stage.boxes(seat),
-        **SEAT,
-    )
+    ok, margin = _in_seat(stage, force, bodies, seat)
     low, high = twin.world_box(*twin.box_pose(seat, stage.xpos, quats), seat.half)
     low, high = low[:, None] - [0, 0, 0.10], high[:, None] + [0, 0, 0.35]
     depth = twin.inside(stage.xpos[:, bodies].astype(np.float64), low, high)
@@ -200,15 +217,7 @@ def test_sit_sofa_released_thresholds(device, twin, first, second, force, good):
     stage.xpos[0, 1], stage.xpos[0, 2] = first, second
     forces = np.zeros((1, BODIES), np.float32)
     forces[0, 1] = force
-    ok, _ = stage.judge(
-        success.launch_sit_sofa_released,
-        stage.xpos,
-        stage.xquat,
-        forces,
-        bodies=stage.up([1, 2], wp.int32),
-        seat=stage.boxes(twin.Marker(0, (0, 0, 0.3), UPRIGHT, (0.9, 0.4, 0.1))),
-        **SEAT,
-    )
+    ok, _ = _in_seat(stage, forces, [1, 2], twin.Marker(0, (0, 0, 0.3), UPRIGHT, (0.9, 0.4, 0.1)))
     assert ok[0] == good
 
 
@@ -219,16 +228,7 @@ def test_boxing_random(device, twin, min_radius):
     stage = twin.Stage(device, spread=0.25, quats=quats)
     palms, offsets = [6, 1], np.float32([[0.08, 0.01, 0.0], [0.08, -0.01, 0.02]])
     target = twin.Marker(4, (0.01, 0.02, 0.0), UPRIGHT, (0.05, 0.04, 0.07))
-    ok, margin = stage.judge(
-        success.launch_boxing,
-        stage.xpos,
-        quats,
-        palm_body=stage.up(palms, wp.int32),
-        palm_offset=wp.array(offsets, dtype=wp.vec3, device=device),
-        target=stage.boxes(target),
-        min_radius=min_radius,
-        pad=0.08,
-    )
+    ok, margin = _punches(stage, palms, offsets, target, min_radius)
     points = stage.xpos[:, palms] + np.einsum("wpij,pj->wpi", twin.matrix(quats[:, palms]), offsets.astype(np.float64))
     centre, _ = twin.box_pose(target, stage.xpos, quats)
     twin.check(ok, margin, max(0.07, min_radius) + 0.08 - np.linalg.norm(points - centre[:, None], axis=-1).min(1))
@@ -245,16 +245,7 @@ def test_boxing_thresholds(device, twin, distance, paper, released, palm):
     stage.xpos[0, 4] = (1, 2, 0.8)
     stage.xpos[0, [6, 1][palm]] = np.array([1, 2, 0.8]) - [0.1, 0, distance]
     for min_radius, expected in ((0.0, paper), (0.10, released)):
-        ok, _ = stage.judge(
-            success.launch_boxing,
-            stage.xpos,
-            stage.xquat,
-            palm_body=stage.up([6, 1], wp.int32),
-            palm_offset=wp.array([(0.1, 0, 0)] * 2, dtype=wp.vec3, device=device),
-            target=stage.boxes(twin.Marker(4, (0, 0, 0), UPRIGHT, (0.05,) * 3)),
-            min_radius=min_radius,
-            pad=0.08,
-        )
+        ok, _ = _punches(stage, [6, 1], [(0.1, 0, 0)] * 2, twin.Marker(4, (0, 0, 0), UPRIGHT, (0.05,) * 3), min_radius)
         assert ok[0] == expected
 
 
@@ -266,21 +257,10 @@ def test_vis_navi_random(device, twin, ring):
     _lean(stage, twin, tilt=0.9)
     stage.xpos[:, :, 2] *= 20
     stage.xpos[:, 7] *= 0.1
-    feet = [1, 2, 3, 4]
     zone = twin.Marker(7, (0.02, 0, 1), (0.9, 0, 0, 0.2), (0.48, 0.47, 1.0))
-    ok, margin = stage.judge(
-        success.launch_vis_navi,
-        stage.xpos,
-        quats,
-        stage.qpos,
-        root_qpos_adr=3,
-        feet=stage.up(feet, wp.int32),
-        zone=stage.boxes(zone),
-        round_zone=ring,
-        **STAND,
-    )
+    ok, margin = _in_zone(stage, zone, ring)
     centre, r = twin.box_pose(zone, stage.xpos, quats)
-    local = np.einsum("wij,wfi->wfj", r, stage.xpos[:, feet] - centre[:, None])[..., :2]
+    local = np.einsum("wij,wfi->wfj", r, stage.xpos[:, FEET] - centre[:, None])[..., :2]
     half = np.float64(np.float32(zone.half[:2]))
     slack = half.min() - np.linalg.norm(local, axis=2) if ring else twin.inside(local, -half, half)
     expected = np.minimum(slack.min(1), _stand(stage, twin))
@@ -295,16 +275,7 @@ def test_vis_navi_needs_every_foot(device, twin, foot):
     stage.xpos[:, 1:5] = 0.1
     stage.xpos[1, 1 + foot, 0], stage.xpos[2, 1 + foot, 1] = 0.501, 0.499
     stage.qpos[3, 5] = 0.449
-    ok, _ = stage.judge(
-        success.launch_vis_navi,
-        stage.xpos,
-        stage.xquat,
-        stage.qpos,
-        root_qpos_adr=3,
-        feet=stage.up([1, 2, 3, 4], wp.int32),
-        zone=stage.boxes(twin.Marker(0, (0, 0, 1), UPRIGHT, (0.5, 0.5, 1))),
-        **STAND,
-    )
+    ok, _ = _in_zone(stage, twin.Marker(0, (0, 0, 1), UPRIGHT, (0.5, 0.5, 1)))
     assert ok.tolist() == [1, 0, 1, 0]
 
 
@@ -315,15 +286,5 @@ def test_vis_navi_ring_is_the_disc_in_the_box(device, twin, x, y, box, disc):
     stage.xpos[:, 1:5] = 0.1
     stage.xpos[0, 3, :2] = x, y
     for ring, good in ((False, box), (True, disc)):
-        ok, _ = stage.judge(
-            success.launch_vis_navi,
-            stage.xpos,
-            stage.xquat,
-            stage.qpos,
-            root_qpos_adr=3,
-            feet=stage.up([1, 2, 3, 4], wp.int32),
-            zone=stage.boxes(twin.Marker(0, (0, 0, 1), UPRIGHT, (0.6, 0.485, 1))),
-            round_zone=ring,
-            **STAND,
-        )
+        ok, _ = _in_zone(stage, twin.Marker(0, (0, 0, 1), UPRIGHT, (0.6, 0.485, 1)), ring)
         assert ok[0] == good

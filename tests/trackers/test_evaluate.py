@@ -462,3 +462,22 @@ def test_film_shows_the_robot(tmp_path, monkeypatch):
     strip = np.asarray(Image.open(path).convert("RGB")).astype(int)
     first, second = strip[-48:, :48], strip[-48:, -48:]
     assert np.abs(first - second).max() > 60
+
+
+def test_film_of_the_push_suite_shows_the_fall(tmp_path, monkeypatch):
+    """`--film` with the push suite is the ramp and nothing else; a tracker that balances nothing lies at its end."""
+    from arena_newton.trackers.base import get
+
+    for name, value in (("PICTURES", 2), ("WIDTH", 48), ("HEIGHT", 48)):
+        monkeypatch.setattr(tracker_film, name, value)
+    name = next(iter(tracker_film.FILMED_PUSHES))
+    (cell,) = (cell for cell in suite("push") if cell.name == name)
+    short = replace(cell, seconds=5.0, blows=replace(cell.blows, segments=1))
+    monkeypatch.setattr(tracker_film, "suite", lambda name: {"push": [suite("push")[0], short]}[name])
+    monkeypatch.setitem(tracker_film.SHOWN, name, (0.0, 4.9))
+    (path,) = tracker_film.film(get("pd"), "pd", tmp_path, blows=True, engine="mujoco", threads=1)
+    assert path.name == "film_pd_blows.png"
+    strip = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    first, last = strip[-48:, :48], strip[-48:, -48:]
+    changed = np.abs(first - last).max(axis=2) > 60
+    assert changed[:24].any(), "the head is gone from the upper half"

@@ -32,6 +32,13 @@ def with_wrong_order(tracker):
     tracker.front_end.write = lambda c, s: write(dataclasses.replace(c, joints=c.joints[:, order]), s)
 
 
+def with_half_the_command(tracker):
+    write = tracker.front_end.write
+    tracker.front_end.write = lambda c, s: write(
+        dataclasses.replace(c, joints=0.5 * c.joints, joint_vel=0.5 * c.joint_vel), s
+    )
+
+
 @pytest.mark.parametrize(
     "spoil, broken",
     [
@@ -39,12 +46,13 @@ def with_wrong_order(tracker):
         (with_wrong_pose, {"joints"}),
         (with_wrong_turn, {"turn"}),
         (with_wrong_order, {"walk"}),
+        (with_half_the_command, {"walk"}),
         (with_wrong_scale, {"pelvis", "joints", "turn", "walk"}),
     ],
-    ids=["right", "pose", "turn", "order", "scale"],
+    ids=["right", "pose", "turn", "order", "half", "scale"],
 )
 def test_mistakes_show(monkeypatch, spoil, broken):
-    """SONIC stands, turns and walks; a wrong pose, turn, order or scale breaks the measure that names it."""
+    """SONIC stands, turns and walks; a wrong pose, turn, order, size or scale breaks the measure that names it."""
     monkeypatch.setattr(stand_check, "ROLLOUTS", 1)
     tracker = trackers.get("sonic")
     spoil(tracker)

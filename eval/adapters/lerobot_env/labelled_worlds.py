@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,9 +20,6 @@ from arena_newton.eval.folders.recordings import OUTCOMES_FILE, packed_actions
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.policies.label_reader import measured_yaw
 from arena_newton.policies.lerobot.checkpoint_facts import vector_of
-
-if TYPE_CHECKING:
-    from typing import Any
 
 __all__ = ["PolicyVectorEnv", "V4VectorEnv", "make_worlds"]
 
@@ -131,23 +128,8 @@ class PolicyVectorEnv(ArenaVectorEnv):
 class V4VectorEnv(PolicyVectorEnv):
     """Worlds of one task whose actions are of v4; an episode's heading is that of its own start."""
 
-    def __init__(
-        self,
-        task: str,
-        num_envs: int = 1,
-        *,
-        policy: PolicyWorlds | None = None,
-        episodes: Path | None = None,
-        **options: object,
-    ):
-        """Build the worlds.
-
-        Args:
-            task: Task name.
-            num_envs: Worlds in the batch.
-            policy: What is known of the policy.
-            episodes: As of `PolicyVectorEnv`.
-            options: Those of `ArenaVectorEnv`.
+    def __init__(self, task: str, num_envs: int = 1, *, policy: PolicyWorlds | None = None, **options: object):
+        """Build the worlds; arguments as of `PolicyVectorEnv`.
 
         Raises:
             InputError: A number is out of range, or as of `PolicyVectorEnv`.
@@ -157,7 +139,7 @@ class V4VectorEnv(PolicyVectorEnv):
             raise InputError(f"realign {policy.realign}: expected 0 to 1")
         if policy.query_ticks < 1:
             raise InputError(f"query_ticks {policy.query_ticks}: expected at least 1")
-        super().__init__(task, num_envs, policy=policy, episodes=episodes, **options)
+        super().__init__(task, num_envs, policy=policy, **cast("dict[str, Any]", options))
         self._decoder = V4Decoder(num_envs, realign=policy.realign)
 
     def step(self, actions: np.ndarray | torch.Tensor) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, Info]:

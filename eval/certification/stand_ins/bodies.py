@@ -8,9 +8,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ import warp as wp
 
 from arena_newton.env import ArenaEnv
 from arena_newton.eval.play.factories import Factories
-from arena_newton.interfaces import RobotState, Spawn, TrackerCommand
+from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot.canonical import ACTION, STAND_ACTION
 from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, DEFAULT_POSE, LEGS, SPAWN_HEIGHT, TICK, DriveGains
 from arena_newton.robot.rotations import (
@@ -35,7 +35,6 @@ from arena_newton.trackers.base import Tracker
 
 if TYPE_CHECKING:
     from arena_newton.interfaces import World
-    from arena_newton.tasks.base import Sample
 
 __all__ = ["BODIES", "Body", "FrozenLegsEnv", "GlidingBase", "GlidingEnv", "HeldLegs", "WithOtherLegs", "freeze_legs"]
 
@@ -248,17 +247,9 @@ class GlidingEnv(ArenaEnv):
         """Base that carries the robot."""
         return GlidingBase(self)
 
-    def reset(
-        self,
-        seeds: Sequence[int],
-        worlds: Sequence[int] | np.ndarray | None = None,
-        *,
-        spawn: Spawn | None = None,
-        samples: Sequence[Mapping[str, Sample]] | None = None,
-        modes: Sequence[str] | None = None,
-    ) -> None:
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: object) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, spawn=spawn, samples=samples, modes=modes)
+        super().reset(seeds, worlds, **cast("dict[str, Any]", more))
         mask = np.zeros(self.worlds, dtype=bool)
         mask[slice(None) if worlds is None else worlds] = True
         self.base.begin(torch.from_numpy(mask).to(self.torch_device))

@@ -11,6 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from arena_newton.eval.certification.stand_ins.handling import HANDLING
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.interaction_view import InteractionView
-from arena_newton.interfaces import Chunk, Observation, Spawn, World
+from arena_newton.interfaces import Chunk, Observation, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.policies.base import Mask
 from arena_newton.policies.experts import ExpertPolicy, Sight
@@ -33,7 +34,6 @@ from arena_newton.policies.experts.style import Style
 from arena_newton.robot.canonical import ACTION
 from arena_newton.robot.g1 import CANONICAL_JOINTS, PALMS
 from arena_newton.robot.rotations import atan2, matrix_from_quat, quat_from_euler, quat_from_rot6d
-from arena_newton.tasks.base import Sample
 from arena_newton.tasks.football import GOAL
 from arena_newton.trackers.base import Tracker
 from arena_newton.trackers.motions.commands import MotionCommand
@@ -440,17 +440,9 @@ class RelocatingEnv(ArenaEnv):
         """True if the object is a free body."""
         return int(self.scene.mj_model.body_mocapid[self.root]) < 0
 
-    def reset(
-        self,
-        seeds: Sequence[int],
-        worlds: Sequence[int] | np.ndarray | None = None,
-        *,
-        spawn: Spawn | None = None,
-        samples: Sequence[Mapping[str, Sample]] | None = None,
-        modes: Sequence[str] | None = None,
-    ) -> None:
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: object) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, spawn=spawn, samples=samples, modes=modes)
+        super().reset(seeds, worlds, **cast("dict[str, Any]", more))
         self.relocated[slice(None) if worlds is None else list(worlds)] = 0.0
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:

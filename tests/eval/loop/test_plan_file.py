@@ -71,7 +71,7 @@ def test_commands_are_those_of_the_house(tmp_path):
     assert commands["build double_desk_sonic"].after == ("record double_desk_sonic_1", "record double_desk_sonic_2")
     train = commands["train all_2"]
     text = " ".join(train.words())
-    assert text.count(str(tmp_path / "datasets")) == 14 == len(train.after) and train.gpus == 1
+    assert text.count(str(tmp_path / "datasets")) == 14 == len(train.after) and train.gpus == 2
     assert "--minutes 9.0" in text and "--seed 2" in text and "--looks 0.6 double_desk=0.3" in text
     assert commands["evaluate all"].after == ("train all_1", "train all_2", "train all_3")
     (tmp_path / "evaluation").mkdir()
@@ -82,7 +82,7 @@ def test_commands_are_those_of_the_house(tmp_path):
 
 def test_what_is_there_is_continued(tmp_path):
     """A recording by `eval resume`, a training by --resume; one without a checkpoint begins again."""
-    commands = made(read_plan("generalist"), tmp_path)
+    commands = made(read_plan("generalist"), tmp_path, gpus=1)
     sets = tmp_path / "demonstrations" / "boxing_twist2"
     sets.mkdir(parents=True)
     (sets / "config.json").write_text("{}")
@@ -98,7 +98,7 @@ def test_what_is_there_is_continued(tmp_path):
 
 def test_several_gpus_train_one_network(tmp_path):
     """By torchrun where the plan gives a training several, as many as there are."""
-    text = (SHIPPED / "generalist.toml").read_text().replace("# one training on each GPU;", "\ngpus = 2 #")
+    text = (SHIPPED / "generalist.toml").read_text()
     (tmp_path / "two.toml").write_text(text)
     plan = read_plan(str(tmp_path / "two.toml"))
     words = made(plan, tmp_path)["train all_1"].words()
@@ -112,14 +112,14 @@ def test_trainings_have_the_time_that_recording_leaves(tmp_path):
     line = '{{"stage": "{}", "name": "a", "began": {}, "ended": {}, "code": 0}}\n'
     (tmp_path / "commands.jsonl").write_text(line.format("record", 0, 180) + line.format("build", 120, 240))
     assert training_minutes(plan, None, tmp_path, 3, 4) == 12.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 4) == 24.0 - 6.0 - 4.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 7.0
-    assert training_minutes(plan, 24.0, tmp_path, 2, 2) == 14.0
-    with pytest.raises(InputError, match="^--minutes 10: recording and building took 4.0, nothing is left to train in"):
-        training_minutes(plan, 10.0, tmp_path, 3, 4)
+    assert training_minutes(plan, 24.0, tmp_path, 3, 6) == 24.0 - 5.0 - 4.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 5.0
+    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 15.0
+    with pytest.raises(InputError, match="^--minutes 9: recording and building took 4.0, nothing is left to train in"):
+        training_minutes(plan, 9.0, tmp_path, 3, 6)
     with (tmp_path / "commands.jsonl").open("a") as file:
         file.write(line.format("train", 250, 310).replace('"code": 0', '"code": -9'))
-    assert training_minutes(plan, 24.0, tmp_path, 2, 2) == 13.0  # what a killed one took is gone
+    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 14.0  # what a killed one took is gone
 
 
 BAD = [
@@ -166,6 +166,9 @@ def test_an_unfit_plan_is_one_error(tmp_path, capsys, old, new, says):
     ("flags", "says"),
     [
         (["--plan", "mine"], "--plan mine: no such file; the package brings the plans generalist tiny"),
+        (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans generalist tiny"),
+        (["--plan", "tiny", "--seeds", "1", "1"], "--seeds 1: given twice"),
+        (["--plan", "tiny", "--only", "train", "train"], "--only train: given twice"),
         (["--plan", "tiny", "--task", "boxing"], "--task: belongs to a loop without --plan, whose file says it"),
         (["--plan", "tiny", "--rows", "chess"], "--rows chess: "),
         (["--plan", "tiny", "--only", "play"], "--only play: unknown, choose from record build train"),

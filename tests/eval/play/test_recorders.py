@@ -135,7 +135,7 @@ def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
 
 
 def test_metrics_of_one_name_are_refused(tmp_path, capsys):
-    """Two metrics of one name, of which a line could hold one, are an error that names both; so is one given twice."""
+    """Two metrics of one name, of which a line could hold one, are an error that names both; so is one twice."""
 
     class Ticks(Metric):
         name = "ticks"
@@ -153,6 +153,26 @@ def test_metrics_of_one_name_are_refused(tmp_path, capsys):
         assert "error: --recorder ticks: given twice" in capsys.readouterr().err
     finally:
         recorders.unregister("ticks")
+    assert main([*RUN, "--recorder", "nope", "--out", str(tmp_path / "b")]) == 2
+    said = capsys.readouterr().err
+    assert "--recorder nope: unknown recorder; known are none: no package is installed that offers one" in said
+
+
+def test_a_metric_that_two_recorders_give_is_refused(tmp_path, capsys):
+    """A recorder that would overwrite another one's metric, even with the same number, stops the run by both names."""
+
+    class First(Recorder):
+        def finish(self, env, world, result):
+            result.extra["speed"] = 1.0
+
+    class Second(Recorder):
+        def finish(self, env, world, result):
+            result.extra |= {"height": 2.0, "speed": 1.0}
+
+    assert main([*RUN, "--out", str(tmp_path / "a")], factories(recorders=lambda env: [First(), Second()])) == 2
+    said = capsys.readouterr().err
+    assert "error: metric speed: is the name of" in said and "<locals>.First and of" in said
+    assert "<locals>.Second; rename one" in said and journal(tmp_path / "a") == {}
 
 
 def test_a_metric_of_any_size_has_its_figures(tmp_path):

@@ -1,4 +1,6 @@
-"""Statistics and batches of made data, for tests of the families."""
+"""Statistics and batches of made data, for tests of the families; what all of them are held to."""
+
+from collections.abc import Callable
 
 import torch
 
@@ -43,3 +45,33 @@ def made_batch(model: TrainableModel, rows: int = 2, tasks: int = 0, seed: int =
         words = ["Open the door.", "Sit on the sofa."]
         batch |= model.tokens([words[i % 2] for i in range(rows)], batch["observation.state"])
     return batch
+
+
+def observed(batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A batch with LeRobot's axis of observed ticks."""
+    names = ("observation.state", "observation.images.front")
+    return {**batch, **{name: batch[name].unsqueeze(1) for name in names}}
+
+
+def trained(model: TrainableModel, optimizer: type[torch.optim.Optimizer], *noise: dict[str, torch.Tensor]) -> None:
+    """Two steps of a training."""
+    steps = optimizer(model.groups(), lr=1e-3)
+    for _ in range(2):
+        steps.zero_grad()
+        model.loss(made_batch(model), *noise).backward()
+        steps.step()
+
+
+def hold_loss(
+    model: TrainableModel, ours: Callable[[], torch.Tensor], theirs: Callable[[], torch.Tensor], **slack: float
+) -> None:
+    """Two ways to one loss agree to 1e-6, and so do the gradients of all parameters, to `slack`."""
+    found = []
+    for loss_of in (ours, theirs):
+        torch.manual_seed(7)
+        model.policy.zero_grad()
+        loss = loss_of()
+        loss.backward()
+        found.append((loss.detach(), [p.grad.clone() for p in model.policy.parameters() if p.grad is not None]))
+    assert torch.allclose(found[0][0], found[1][0], rtol=1e-6)
+    assert all(torch.allclose(a, b, **slack) for a, b in zip(found[0][1], found[1][1], strict=True))

@@ -13,7 +13,7 @@ from arena_newton.errors import InputError
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import families
-from tests.policies.train.made_stats import made_batch, made_stats
+from tests.policies.train.made_stats import hold_loss, made_batch, made_stats, trained
 from tests.policies.train.stock_lerobot import opened, raw_observation
 
 SMALL = recipe("act", "small")
@@ -28,15 +28,7 @@ def model():
 def test_loss_is_lerobots(model):
     """Loss and gradients, with dropout and latent, are `ACTPolicy.forward`'s; it is the mean of its samples' losses."""
     batch = made_batch(model)
-    found = []
-    for loss_of in (lambda: model.loss(batch, model.noise(2)), lambda: model.policy.forward(batch)[0]):
-        torch.manual_seed(7)
-        model.policy.zero_grad()
-        loss = loss_of()
-        loss.backward()
-        found.append((loss.detach(), model.policy.model.action_head.weight.grad.clone()))
-    assert torch.allclose(found[0][0], found[1][0], rtol=1e-6)
-    assert torch.allclose(found[0][1], found[1][1], rtol=1e-5, atol=1e-8)
+    hold_loss(model, lambda: model.loss(batch, model.noise(2)), lambda: model.policy.forward(batch)[0])
     loss, each = model.losses(batch)
     assert torch.allclose(each.mean(), loss) and each[0] != each[1]
 
@@ -54,11 +46,7 @@ def test_padding_does_not_count(model):
 
 def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
     """A trained checkpoint, BatchNorm inside, gives a stock ACT the same actions, from a raw observation."""
-    optimizer = torch.optim.AdamW(model.groups(), lr=1e-3)
-    for _ in range(2):
-        optimizer.zero_grad()
-        model.loss(made_batch(model), {}).backward()
-        optimizer.step()
+    trained(model, torch.optim.AdamW, {})
     model.save(tmp_path, CheckpointFacts(tasks=("boxing",), steps=2))
     policy, before, after = opened(tmp_path)
     observation = raw_observation()

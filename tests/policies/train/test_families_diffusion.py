@@ -8,7 +8,7 @@ from torchvision import models
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import families
-from tests.policies.train.made_stats import made_batch, made_stats
+from tests.policies.train.made_stats import hold_loss, made_batch, made_stats, observed, trained
 from tests.policies.train.stock_lerobot import opened, raw_observation
 
 SMALL = recipe("diffusion", "small")
@@ -20,28 +20,14 @@ def model(narrow_resnet):
     return families.build(SMALL, made_stats(), "cpu")
 
 
-def lerobots(model, batch):
-    """A batch with LeRobot's axis of observed ticks."""
-    names = ("observation.state", "observation.images.front")
-    return {**batch, **{name: batch[name].unsqueeze(1) for name in names}}
-
-
 @pytest.mark.parametrize(("prediction", "mask"), [("epsilon", False), ("sample", True)])
 def test_loss_is_lerobots(model, monkeypatch, mask, prediction):
     """With equal noise loss and gradients are `DiffusionPolicy.forward`'s; it is the mean of its samples' losses."""
     monkeypatch.setattr(model.policy.config, "do_mask_loss_for_padding", mask)
     monkeypatch.setattr(model.policy.config, "prediction_type", prediction)
     batch = made_batch(model)
-    found = []
-    for loss_of in (lambda: model.loss(batch), lambda: model.policy.forward(lerobots(model, batch))[0]):
-        torch.manual_seed(7)
-        model.policy.zero_grad()
-        loss = loss_of()
-        loss.backward()
-        gradients = [p.grad.clone() for p in model.policy.parameters() if p.grad is not None]
-        found.append((loss.detach(), gradients))
-    assert torch.allclose(found[0][0], found[1][0], rtol=1e-5)
-    assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-6) for a, b in zip(found[0][1], found[1][1], strict=True))
+    ours, theirs = lambda: model.loss(batch), lambda: model.policy.forward(observed(batch))[0]
+    hold_loss(model, ours, theirs, rtol=1e-3, atol=1e-6)
     loss, each = model.losses(batch)
     assert torch.allclose(each.mean(), loss) and each[0] != each[1]
 
@@ -53,17 +39,13 @@ def test_noise_decides_the_loss(model):
     drawn = [model.noise(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     losses = [model.loss(batch, noise) for noise in drawn]
     assert torch.equal(losses[0], losses[1]) and not torch.equal(losses[0], losses[2])
-    assert torch.equal(model.loss(lerobots(model, batch), drawn[0]), losses[0])
+    assert torch.equal(model.loss(observed(batch), drawn[0]), losses[0])
     model.policy.train()
 
 
 def test_checkpoint_in_a_stock_lerobot(model, tmp_path):
     """A trained checkpoint gives a stock LeRobot the same actions from the same noise."""
-    optimizer = torch.optim.Adam(model.groups(), lr=1e-3)
-    for _ in range(2):
-        optimizer.zero_grad()
-        model.loss(made_batch(model)).backward()
-        optimizer.step()
+    trained(model, torch.optim.Adam)
     model.save(tmp_path, CheckpointFacts())
     policy, before, after = opened(tmp_path)
     observation, noise = raw_observation(), torch.randn(2, 24, 40)

@@ -12,7 +12,7 @@ from arena_newton.policies.lerobot.encoder_sources import checkpoint_encoders, m
 from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import families, pretrained_weights
 from arena_newton.policies.train.families.policy_model import with_time_axis
-from tests.policies.train.made_stats import made_batch, made_stats
+from tests.policies.train.made_stats import hold_loss, made_batch, made_stats, observed, trained
 from tests.policies.train.stock_lerobot import opened, raw_observation
 
 SMALL = recipe("flow", "small")
@@ -36,12 +36,6 @@ def clip_folder(model, tmp_path_factory):
     return folder
 
 
-def lerobots(batch):
-    """A batch with LeRobot's axis of observed ticks."""
-    names = ("observation.state", "observation.images.front")
-    return {**batch, **{name: batch[name].unsqueeze(1) for name in names}}
-
-
 @pytest.mark.parametrize("mask", [False, True])
 def test_loss_is_lerobots(model, monkeypatch, mask):
     """With equal noise loss and gradients are `MultiTaskDiTPolicy.forward`'s; it is the mean of its samples' losses."""
@@ -51,14 +45,8 @@ def test_loss_is_lerobots(model, monkeypatch, mask):
     batch, noise = made_batch(model), model.noise(2)
     monkeypatch.setattr(model.policy.objective, "_sample_timesteps", lambda rows, device: noise["time"])
     monkeypatch.setattr(torch, "randn_like", lambda value: noise["noise"])
-    found = []
-    for loss_of in (lambda: model.loss(batch, noise), lambda: model.policy.forward(lerobots(batch))[0]):
-        model.policy.zero_grad()
-        loss = loss_of()
-        loss.backward()
-        found.append((loss.detach(), [p.grad.clone() for p in model.policy.parameters() if p.grad is not None]))
-    assert torch.allclose(found[0][0], found[1][0], rtol=1e-6)
-    assert all(torch.allclose(a, b, rtol=1e-4, atol=1e-7) for a, b in zip(found[0][1], found[1][1], strict=True))
+    ours, theirs = lambda: model.loss(batch, noise), lambda: model.policy.forward(observed(batch))[0]
+    hold_loss(model, ours, theirs, rtol=1e-4, atol=1e-7)
     loss, each = model.losses(batch, noise)
     assert torch.allclose(each.mean(), loss) and each[0] != each[1]
     model.policy.train()
@@ -106,11 +94,7 @@ def chunk(policy, before, after, seed=11):
 
 def test_checkpoint_in_a_stock_lerobot(model, tmp_path, capsys):
     """A trained checkpoint, saved silently, gives a stock LeRobot the same actions, with its encoders and tokenizer."""
-    optimizer = torch.optim.Adam(model.groups(), lr=1e-3)
-    for _ in range(2):
-        optimizer.zero_grad()
-        model.loss(made_batch(model)).backward()
-        optimizer.step()
+    trained(model, torch.optim.Adam)
     folder = tmp_path / "first"
     capsys.readouterr()
     model.save(folder, CheckpointFacts())

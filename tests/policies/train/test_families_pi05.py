@@ -15,7 +15,7 @@ from arena_newton.policies.recipes.training_recipe import recipe
 from arena_newton.policies.train.families import families, pretrained_weights
 from arena_newton.policies.train.families.pi05_family import PADDED, load_base, prompts
 from tests.fuzz.mutants import damaged
-from tests.policies.train.made_stats import made_batch, made_stats
+from tests.policies.train.made_stats import hold_loss, made_batch, made_stats, trained
 from tests.policies.train.stock_lerobot import opened, raw_observation
 
 SMALL = recipe("pi05", "small")
@@ -49,14 +49,7 @@ def test_loss_is_lerobots(model, monkeypatch):
     batch, noise = made_batch(model), model.noise(2)
     monkeypatch.setattr(model.policy.model, "sample_noise", lambda shape, device: noise["noise"])
     monkeypatch.setattr(model.policy.model, "sample_time", lambda rows, device: noise["time"])
-    found = []
-    for loss_of in (lambda: model.loss(batch, noise), lambda: model.policy.forward(batch)[0]):
-        model.policy.zero_grad()
-        loss = loss_of()
-        loss.backward()
-        found.append((loss.detach(), model.policy.model.action_in_proj.weight.grad.clone()))
-    assert torch.equal(found[0][0], found[1][0])
-    assert torch.allclose(found[0][1], found[1][1])
+    hold_loss(model, lambda: model.loss(batch, noise), lambda: model.policy.forward(batch)[0])
     loss, each = model.losses(batch, noise)
     assert torch.allclose(each.mean(), loss) and each[0] != each[1]
     assert noise["noise"].shape == (2, 20, 40)
@@ -165,11 +158,7 @@ def test_a_policy_that_lost_weights_is_noticed(base, monkeypatch):
 
 def test_checkpoint_in_lerobot(model, tmp_path):
     """A trained checkpoint gives LeRobot's classes the same actions from the same noise."""
-    optimizer = torch.optim.AdamW(model.groups(), lr=1e-3)
-    for _ in range(2):
-        optimizer.zero_grad()
-        model.loss(made_batch(model)).backward()
-        optimizer.step()
+    trained(model, torch.optim.AdamW)
     model.save(tmp_path, CheckpointFacts())
     assert (tmp_path / GEMMA_FILE).is_file() and (tmp_path / "tokenizer" / "tokenizer.json").is_file()
     with checkpoint_encoders(tmp_path):
