@@ -578,23 +578,13 @@ def test_training_options_have_one_default():
     assert not found
 
 
-@pytest.mark.parametrize(
-    "flags",
-    [
-        ["--worlds", "-1"],
-        ["--keep-last", "-1"],
-        ["--iterations", "0"],
-        ["--minutes", "-1"],
-        ["--minibatches", "1000"],
-        ["--learning-rate", "nan"],
-        ["--families", "walk", "-3"],
-        ["--seed", "-1"],
-        ["--episode-s", "1e30"],
-        ["--rewards", "heading", "nan"],
-        ["--events"],
-        ["--events", "push"],
-    ],
+UNFIT = (
+    "--worlds -1; --keep-last -1; --iterations 0; --minutes -1; --minibatches 1000; --learning-rate nan; --seed -1; "
+    "--families walk -3; --episode-s 1e30; --rewards heading nan; --events; --events push"
 )
+
+
+@pytest.mark.parametrize("flags", map(str.split, UNFIT.split("; ")), ids=" ".join)
 def test_numbers_out_of_range_are_refused_first(flags, tmp_path, capsys):
     """A number that no training can use, or none, is one line with its flag, before references are made."""
     log_dir = tmp_path / "log"
