@@ -74,7 +74,8 @@ class Registry[T]:
             InputError: The message says what is known, or who offers it.
         """
         if name not in self.names():
-            raise InputError(f"--{self.noun} {name}: unknown {self.noun}; known are {', '.join(self.names())}")
+            known = ", ".join(self.names()) or "none: no package is installed that offers one"
+            raise InputError(f"--{self.noun} {name}: unknown {self.noun}; known are {known}")
         if name in self._registered:
             return
         offers = ["this package"] if name in self.built_in else []

@@ -46,7 +46,7 @@ _WORLD_AXES = np.array([[[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0
 _CROSS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0],
                    [0, 0, 1, 0, 0, 0, -1, 0, 0],
                    [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=np.float64)  # fmt: skip
-"""Of a vector, the nine numbers of the matrix of its cross product."""
+"""Map from a vector to the nine numbers of the matrix of its cross product."""
 
 Scaled = list[tuple[str, list[int] | tuple[list[int], int]]]
 """Fields of a MuJoCo model, and the index of the numbers in each, that one parameter scales."""

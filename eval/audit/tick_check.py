@@ -85,7 +85,7 @@ class _Recorded:
     velocities: np.ndarray
     """Before each tick, shape [ticks, nv]."""
     radii: np.ndarray
-    """Of spin, shape [nv] (`surface_radii`)."""
+    """Radii of spin, shape [nv] (`surface_radii`)."""
 
 
 class StatesAgain(Recorder):

@@ -76,6 +76,10 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         raise InputError("--policy: asks at the queries of --replay or --all, or plays --fresh episodes; add one")
     if options.policy is None and (options.fresh or options.tolerance):
         raise InputError("--fresh and --tolerance: are of a --policy; name it")
+    if options.replay and options.all:
+        raise InputError("--replay and --all: both say which episodes are played again; drop one")
+    if options.draw is not None and not (options.replay or options.fresh):
+        raise InputError("--draw: draws the episodes of --replay or --fresh; add one of them")
     if options.head is not None and len(named) > 1:
         raise InputError("--head: is of one folder")
     draw = secrets.randbelow(1 << 31) if options.draw is None else options.draw

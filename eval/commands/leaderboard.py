@@ -38,7 +38,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
         0: nothing contradicts. 1: something does.
 
     Raises:
-        InputError: An entry is unfit, or there is none.
+        InputError: An entry is unfit, there is none, or the folder of the site holds something else.
         StorageError: A page cannot be written.
     """
     import re
@@ -107,7 +107,8 @@ def bundle(folders: Sequence[Path], options: BundleOptions) -> int:
     """Write the entry.
 
     Raises:
-        InputError: The folder holds no run or a damaged one, or there is an entry already.
+        InputError: The folder holds no run or a damaged one, there is another entry already, or the entry would be
+            written into the results.
         StorageError: A file cannot be written.
     """
     from arena_newton.cli.flags import check_least, user_path
@@ -119,6 +120,8 @@ def bundle(folders: Sequence[Path], options: BundleOptions) -> int:
 
     check_least(options, 0, "actions", "strips")
     (folder,), out = folders, user_path(options.out)
+    if out.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"--out {out}: is in the results; an entry is a folder of its own")
     before = read_entry(out) if (out / ENTRY_FILE).exists() else None
     data, known = made_bundle(folder, options.actions, options.strips, read_statements(out))
     if before is not None and before.head != known["head"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.draws import drawn, odds
 from arena_newton.eval.audit.folder_audit import AUDIT_FILE, CONSISTENT, LEVELS, SELF_REPORTED, Audit, audited, runs_in
-from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE, ENTRY_FILE, BoardEntry, read_entry
+from arena_newton.eval.leaderboard.entry_file import (
+    BUNDLE_FILE,
+    ENTRY_FILE,
+    SIMULATOR,
+    UNTRAINED,
+    BoardEntry,
+    read_entry,
+)
 from arena_newton.eval.leaderboard.evidence import AuditStatement, earned_level, read_statements
-from arena_newton.eval.leaderboard.result_bundle import unpack
+from arena_newton.eval.leaderboard.result_bundle import strays, unpack
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS, PROTOCOL_SEEDS
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import SUITE_FILE, step_budgets
@@ -38,6 +45,8 @@ __all__ = ["CheckedEntry", "check_entry"]
 
 PROTOCOL_RULES = "paper"
 """Rule set of the protocol."""
+SCRIPTED = ("expert", "stand")
+"""Policies of this package that have nothing to train."""
 
 
 @dataclass
@@ -81,11 +90,9 @@ def check_entry(
         except InputError as error:
             raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
         checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
-        if entry.training_data == "none":  # a policy of many tasks without a merged training
+        if entry.training_data == UNTRAINED:  # a policy of many tasks without a merged training
             checked.rates = [replace(rate, setting=IN_GMT) for rate in checked.rates]
-        weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
-        if cells and entry.checkpoint != weights:
-            checked.faults.append(f"{where}: checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}")
+        checked.faults += [f"{where}: {fault}" for fault in _misstated(entry, cells)]
     elif entry.bundle:
         checked.notes.append(f"Its bundle, SHA-256 {entry.bundle}, is not part of this board: see its source.")
     if checked.faults:
@@ -101,6 +108,23 @@ def check_entry(
     if not checked.faults:
         _hold_level(checked, folder, at_hand=at_hand)
     return checked
+
+
+def _misstated(entry: BoardEntry, cells: Sequence[PlayedCell]) -> Iterator[str]:
+    """Statements of an entry that are not those of its runs."""
+    if not cells:
+        return
+    if entry.simulator != SIMULATOR:
+        yield f"simulator is {shown(entry.simulator)}, its runs are of {SIMULATOR}"
+    weights = " ".join(sorted({cell.weights for cell in cells} - {""}))
+    if entry.checkpoint != weights:
+        yield f"checkpoint is {shown(entry.checkpoint)}, its runs have {shown(weights)}"
+    data = shown(entry.training_data)
+    if entry.training_data == UNTRAINED:
+        if weights:
+            yield f"training_data is {data}, the policy of its runs has weights"
+    elif scripted := sorted({cell.records[0].policy for cell in cells if cell.records[0].policy in SCRIPTED}):
+        yield f"training_data is {data}, policy {scripted[0]} of its runs is not trained"
 
 
 def _hold_level(checked: CheckedEntry, folder: Path, *, at_hand: bool) -> None:
@@ -156,6 +180,8 @@ def _audit(
         checked.faults.append(f"{checked.name}/{ENTRY_FILE}: head is {shown(said)}, its runs have {shown(found)}")
     if checked.faults:
         return []
+    if stray := strays(root, [audit.run for audit in checked.audits]):
+        raise InputError(f"{root}: {shown(stray[0])} is of no run in it")
     cells = read_cells([root] if suite else folders)
     checked.faults += cells.changed
     played = [cell for cell in cells.cells if isinstance(cell, PlayedCell)]

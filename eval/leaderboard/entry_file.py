@@ -17,11 +17,15 @@ from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, loaded, read_regular
 from arena_newton.files.text import is_printable, plain_text
 
-__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "BoardEntry", "entry_text", "read_entry"]
+__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "SIMULATOR", "UNTRAINED", "BoardEntry", "entry_text", "read_entry"]
 
 ENTRY_FILE = "entry.toml"
 BUNDLE_FILE = "bundle.zip"
 """Runs of an entry, next to its file."""
+SIMULATOR = "arena_newton"
+"""Simulator of every run in a bundle."""
+UNTRAINED = "none"
+"""Training data of a policy that was not trained."""
 
 Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(re.fullmatch(r"\d{4}-\d\d(?:-\d\d)?", v)))]
 Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]

@@ -23,6 +23,9 @@ with 88 %."""
 MOST_TOLERANCE = 1e-4
 """Largest --tolerance under which answers of a policy are still the recorded ones."""
 
+SERVED = ("remote", "process")
+"""Policies of another program, whose own name a run does not know."""
+
 Number = Annotated[int, Fit("a number from 0 on", lambda v: v >= 0)]
 
 
@@ -109,9 +112,13 @@ def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement])
 
 def _not_asked(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
     """First thing that an audit that asked the policy again would have; empty: nothing is missing."""
-    for one in (stated[audit.head] for audit in audits):
+    for audit in audits:
+        one, played = stated[audit.head], str(audit.run.config["policy"])
         if one.policy is None or one.asked != len(one.played):
             return f"{AUDIT_FILE}: asked is {shown(one.asked)} of {counted(len(one.played), 'episode')} played again"
+        kind, own = one.policy.partition(":")[0], played.partition(":")[0]
+        if kind not in (own, *SERVED) and own not in SERVED:
+            return f"{AUDIT_FILE}: policy is {shown(one.policy)}, its run has {shown(played)}"
         if not 0 <= one.tolerance <= MOST_TOLERANCE:
             return f"{AUDIT_FILE}: tolerance is {one.tolerance:g}, expected at most {MOST_TOLERANCE:g}"
     return ""

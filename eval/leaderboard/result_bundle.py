@@ -6,7 +6,7 @@ import hashlib
 import io
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.audit.folder_audit import audited, runs_in
 from arena_newton.eval.folders.results import RunRecord
+from arena_newton.eval.leaderboard.entry_file import SIMULATOR
 from arena_newton.eval.leaderboard.evidence import AuditStatement, earned_level
 from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
@@ -25,7 +26,7 @@ from arena_newton.eval.tables.episode_table import cells_of
 from arena_newton.files.stored_json import read_regular
 from arena_newton.files.untrusted_files import create, read_arrays, zip_members
 
-__all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strips_of", "unpack"]
+__all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strays", "strips_of", "unpack"]
 
 MAX_BUNDLE_BYTES = 64 << 20
 MAX_UNPACKED_BYTES = 512 << 20
@@ -84,7 +85,7 @@ def made_bundle(
         raise InputError(f"{folder}: its bundle has {stream.tell():,} bytes, expected at most {MAX_BUNDLE_BYTES:,}")
     cells = [cell for audit in audits for cell in cells_of(audit.run)]
     known: dict[str, object] = {
-        "simulator": "arena_newton",
+        "simulator": SIMULATOR,
         "trackers": sorted({cell.tracker for cell in cells}),
         "level": earned_level(audits, stated)[0],
         "checkpoint": " ".join(sorted({cell.weights for cell in cells} - {""})),
@@ -151,3 +152,14 @@ def unpack(path: Path, digest: str, into: Path) -> str | None:
     except Exception as error:  # a damaged archive fails anywhere inside zipfile
         raise InputError(f"{path}: not readable as an archive ({error})") from None
     return None
+
+
+def strays(root: Path, runs: Sequence[RunRecord]) -> list[str]:
+    """Files of an unpacked bundle that none of its runs has, by their names in it."""
+    known = {root / SUITE_FILE}
+    if (root / SUITE_FILE).is_file():
+        known |= set(root.glob("suite.*.jsonl"))
+    for run in runs:
+        media = {path for record in run.records for path in (record.media or {}).values()}
+        known |= {run.folder / name for name in (CONFIG_FILE, JOURNAL_FILE, *media)}
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file() and path not in known)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import LEVELS
 from arena_newton.eval.folders.failure_stage import FailureStage
 from arena_newton.eval.leaderboard.checked_entry import CheckedEntry
@@ -29,6 +30,9 @@ __all__ = ["write_site"]
 
 MOST_STRIPS = 12
 """Film strips on the page of an entry."""
+TITLE = b"HumanoidArena leaderboard</title>"
+"""End of the title of every page, by which a former build is known."""
+MAX_PAGE_BYTES = 64 << 20
 BASE = "base"
 
 
@@ -122,11 +126,15 @@ def write_site(entries: Sequence[CheckedEntry], folders: Sequence[Path], out: Pa
     Args:
         entries: Entries without contradictions; their unpacked bundles are still there.
         folders: Folder of each.
-        out: Folder of the site; files that are there are replaced, others stay.
+        out: Folder of the site; pages of a former build are replaced, other files stay.
 
     Raises:
+        InputError: A page would replace one of something else.
         OSError: A file cannot be written.
     """
+    for name in ("index", *(one.name for one in entries)):
+        if (path := out / f"{name}.html").exists() and TITLE not in read_regular(path, MAX_PAGE_BYTES):
+            raise InputError(f"--out {out}: {path.name} is of something else than a leaderboard; name another folder")
     sections = _sections(entries)
     shown = [row for section in sections for row in section.rows]
     filters = {

@@ -127,7 +127,8 @@ def read_plan(given: str) -> LoopPlan:
         path = SHIPPED / f"{given}.toml"
     if not path.is_file():
         known = " ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
-        raise InputError(f"--plan {given}: no such file; the package brings the plans {known}")
+        found = "is a folder, expected a file" if path.is_dir() else "no such file"
+        raise InputError(f"--plan {given}: {found}; the package brings the plans {known}")
     content, _ = read_toml(path)
     for key in content:
         if key not in TABLES:

@@ -50,8 +50,12 @@ def run(options: LoopOptions) -> int:
         if one.name not in OF_ALL and getattr(options, one.name) != one.default:
             raise InputError(f"{flag_name(one.name)}: belongs to a loop without --plan, whose file says it")
     plan = read_plan(str(options.plan))
-    rows = [plan.row(name) for name in dict.fromkeys(options.rows)] or [plan.rows[0]]
-    seeds = sorted(set(options.seeds)) or list(plan.settings.seeds)
+    for name in ("rows", "seeds", "only"):
+        given = getattr(options, name)
+        if twice := [value for value in given if given.count(value) > 1]:
+            raise InputError(f"--{name} {twice[0]}: given twice")
+    rows = [plan.row(name) for name in options.rows] or [plan.rows[0]]
+    seeds = sorted(options.seeds) or list(plan.settings.seeds)
     if not all(1 <= seed <= 9999 for seed in seeds):
         raise InputError(f"--seeds {' '.join(map(str, options.seeds))}: expected numbers 1 to 9999")
     for stage in options.only:

@@ -224,6 +224,8 @@ def _task_numbers(
     found: dict[str, float] = {}
     for text in given:
         task, _, number = text.rpartition("=")
+        if task in found:
+            raise InputError(f"{flag} {text}: {task or 'a value for all'} is given twice")
         try:
             found[task] = float(number)
         except ValueError:

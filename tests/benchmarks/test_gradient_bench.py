@@ -29,6 +29,22 @@ def test_ticks_and_loops_are_compared(monkeypatch):
     assert gradient_bench._loop("vis_navi", "pd", 2, 1e-3).value == pytest.approx(0.01, rel=0.01)
 
 
+def test_the_nearer_side_of_a_kink_within_the_step_counts(monkeypatch):
+    """A slope that jumps next to the actions is compared on the side that has it, and the note says so."""
+    honest, at = gradient_bench.closed_loop, []
+
+    def kinked(env, actions, *given, **named):
+        rolled = honest(env, actions, *given, **named)
+        if not isinstance(actions, torch.Tensor):
+            return rolled
+        at.append(actions.detach())
+        return rolled._replace(qpos=rolled.qpos + 0.01 * ((actions - at[0]).sum() - 1e-9).clamp_min(0.0))
+
+    monkeypatch.setattr(gradient_bench, "closed_loop", kinked)
+    found = gradient_bench._loop("vis_navi", "pd", 2, 1e-3)
+    assert found.verdict == "pass" and "; actions central " in found.note and ", one side " in found.note
+
+
 def test_a_loop_is_compared_with_the_episode_that_it_replays(monkeypatch):
     """The distance is that of whole positions; a loop that starts elsewhere misses its bar."""
     monkeypatch.setattr(gradient_bench, "LONGEST", 5)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator, Sequence
-
-import tyro
+from pathlib import Path
 
 from arena_newton.cli.command_line import exit_code, program
-from arena_newton.errors import InputError
-from arena_newton.trackers.train.train_options import CurveOptions, ExportCommand, TrainOptions, check
+from arena_newton.cli.command_table import HELP
+from arena_newton.cli.flags import folders_named, parse_flags
+from arena_newton.trackers.train.train_options import CurveOptions, ExportOptions, TrainOptions, check
 
 __all__ = ["main"]
 
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments and arguments[0] in ("export", "curves"):
             (_export if arguments[0] == "export" else _curves)(arguments[1:])
             return
-        options = tyro.cli(TrainOptions, args=arguments, prog=PROG)
+        options = parse_flags(TrainOptions, arguments, PROG)
         check(options)  # before the libraries are loaded
         from arena_newton.cli.quiet import quiet_warp
 
@@ -57,23 +57,32 @@ def without_wandb(logger: str) -> Iterator[None]:
             del sys.modules["wandb"]
 
 
-def _export(arguments: Sequence[str]) -> None:
-    if not arguments:
-        raise InputError(f"export: name the checkpoint: {PROG} export CHECKPOINT --out FILE.safetensors")
-    options = tyro.cli(ExportCommand, args=list(arguments), prog=f"{PROG} export")
+def _export(arguments: list[str]) -> None:
+    files, options = _named(
+        ExportOptions, arguments, "export", "the checkpoint", "CHECKPOINT --out FILE.safetensors", 1
+    )
     from arena_newton.trackers.train.export import export
 
-    out = export(options.checkpoint, options)
+    out = export(files[0], options)
     print(f"wrote {out} ({out.stat().st_size / 2**20:.2f} MiB) and its card")
 
 
-def _curves(arguments: Sequence[str]) -> None:
-    options = tyro.cli(CurveOptions, args=list(arguments), prog=f"{PROG} curves")
-    if not options.runs:
-        raise InputError(f"curves: name the folders of trainings: {PROG} curves RUN [RUN ...] --out FILE.png")
+def _curves(arguments: list[str]) -> None:
+    shown = "RUN [RUN ...] --out FILE.png"
+    runs, options = _named(CurveOptions, arguments, "curves", "folders of trainings", shown)
     from arena_newton.trackers.train.curves import draw
 
-    print(f"wrote {draw(options.runs, options.out)}")
+    print(f"wrote {draw(runs, options.out)}")
+
+
+def _named[T](
+    kind: type[T], arguments: list[str], command: str, noun: str, shown: str, most: int | None = None
+) -> tuple[list[Path], T]:
+    """Files that a subcommand is given, and its flags."""
+    if any(argument in HELP for argument in arguments):
+        parse_flags(kind, ["--help"], f"{PROG} {command} {shown}")
+    files = folders_named(arguments, command, PROG, noun=noun, shown=shown, most=most)
+    return files, parse_flags(kind, arguments, f"{PROG} {command}")
 
 
 if __name__ == "__main__":

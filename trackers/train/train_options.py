@@ -20,7 +20,6 @@ __all__ = [
     "FAMILY_WEIGHTS",
     "GPU_WORLDS",
     "CurveOptions",
-    "ExportCommand",
     "ExportOptions",
     "TrainOptions",
     "check",
@@ -142,8 +141,8 @@ class TrainOptions:
 class ExportOptions:
     """Write a tracker's weights file and its card."""
 
-    out: Path
-    """The file, `.safetensors`; the card is written next to it as .json and .md."""
+    out: Path = Path("tracker.safetensors")
+    """The file; the card is written next to it as .json and .md."""
     metrics: Path | None = None
     """JSON file of an evaluation, for the card."""
     note: str = ""
@@ -155,20 +154,10 @@ class ExportOptions:
     leaves a preferred side, and a walk whose command has no heading turns that way."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportCommand(ExportOptions):
-    """Write a tracker's weights file and its card."""
-
-    checkpoint: tyro.conf.Positional[Path]
-    """Checkpoint of a training, such as runs/tracker/model_last.pt."""
-
-
 @dataclass(frozen=True)
 class CurveOptions:
-    """Draw the curves of trainings over each other."""
+    """Draw the curves of trainings, their --log-dir or progress.jsonl, over each other."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of trainings (their --log-dir), or progress.jsonl files."""
     out: Path = Path("curves.png")
     """Picture: .png, .svg or .pdf."""
 

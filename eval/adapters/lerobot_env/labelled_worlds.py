@@ -128,7 +128,7 @@ class PolicyVectorEnv(ArenaVectorEnv):
 class V4VectorEnv(PolicyVectorEnv):
     """Worlds of one task whose actions are of v4; an episode's heading is that of its own start."""
 
-    def __init__(self, task: str, num_envs: int = 1, *, policy: PolicyWorlds | None = None, **options: Any):
+    def __init__(self, task: str, num_envs: int = 1, *, policy: PolicyWorlds | None = None, **options: object):
         """Build the worlds; arguments as of `PolicyVectorEnv`.
 
         Raises:
@@ -139,7 +139,7 @@ class V4VectorEnv(PolicyVectorEnv):
             raise InputError(f"realign {policy.realign}: expected 0 to 1")
         if policy.query_ticks < 1:
             raise InputError(f"query_ticks {policy.query_ticks}: expected at least 1")
-        super().__init__(task, num_envs, policy=policy, **options)
+        super().__init__(task, num_envs, policy=policy, **cast("dict[str, Any]", options))
         self._decoder = V4Decoder(num_envs, realign=policy.realign)
 
     def step(self, actions: np.ndarray | torch.Tensor) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, Info]:

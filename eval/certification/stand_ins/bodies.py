@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -247,9 +247,9 @@ class GlidingEnv(ArenaEnv):
         """Base that carries the robot."""
         return GlidingBase(self)
 
-    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: Any) -> None:
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: object) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, **more)
+        super().reset(seeds, worlds, **cast("dict[str, Any]", more))
         mask = np.zeros(self.worlds, dtype=bool)
         mask[slice(None) if worlds is None else worlds] = True
         self.base.begin(torch.from_numpy(mask).to(self.torch_device))

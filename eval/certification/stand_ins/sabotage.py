@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -440,9 +440,9 @@ class RelocatingEnv(ArenaEnv):
         """True if the object is a free body."""
         return int(self.scene.mj_model.body_mocapid[self.root]) < 0
 
-    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: Any) -> None:
+    def reset(self, seeds: Sequence[int], worlds: Sequence[int] | np.ndarray | None = None, **more: object) -> None:
         """See `ArenaEnv.reset`."""
-        super().reset(seeds, worlds, **more)
+        super().reset(seeds, worlds, **cast("dict[str, Any]", more))
         self.relocated[slice(None) if worlds is None else list(worlds)] = 0.0
 
     def step(self, action: torch.Tensor | np.ndarray, worlds: np.ndarray | None = None) -> np.ndarray:

@@ -125,6 +125,13 @@ def test_bad_input_is_one_line_and_code_2(tmp_path, capsys):
     assert capsys.readouterr().err == f"error: {tmp_path}: no results folder (it has no config.json)\n"
 
 
+@pytest.mark.parametrize("flags", [["--draw", "7"], ["--draw", "7", "--all"], ["--replay", "1", "--all"]])
+def test_a_flag_that_would_be_ignored_is_refused(honest, flags, capsys):
+    """A number that draws nothing, and a number of episodes where all are played, are one line with the flag."""
+    assert main(["audit", str(honest / "run"), *flags]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {flags[0]}")
+
+
 def with_file(name, content):
     """Damage: a file of the folder with other bytes; none: it is gone."""
 

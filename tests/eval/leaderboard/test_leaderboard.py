@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from eval_fakes import factories
+from eval_fakes import FakePolicy, factories
 from made_signals import signals
 
 from arena_newton.eval.__main__ import main
@@ -228,8 +228,10 @@ def unfinished(members):
         (lambda entry: fill(entry, trackers=["twist2"]), "trackers are twist2, its numbers have sonic twist2"),
         (lambda entry: fill(entry, checkpoint="0123456789ab"), "checkpoint is"),
         (lambda entry: fill(entry, numbers="paper", rows=["act"]), "numbers of paper are not those of its bundle"),
+        (lambda entry: fill(entry, simulator="Isaac Sim"), 'simulator is "Isaac Sim", its runs are of arena_newton'),
+        (lambda entry: fill(entry, training_data="scripted"), "policy expert of its runs is not trained"),
     ],
-    ids=["outcome", "older", "unfinished", "actions", "bytes", "trackers", "weights", "numbers"],
+    ids="outcome older unfinished actions bytes trackers weights numbers simulator data".split(),
 )
 def test_an_edited_result_is_found(entry, edit, named, capsys):
     """A changed outcome with its links, changed actions, bytes and statements contradict; no page is written."""
@@ -242,7 +244,7 @@ def test_an_edited_result_is_found(entry, edit, named, capsys):
 def audited(made):
     """An entry of the run after an audit that played all its episodes again and asked the policy."""
     entry = made.parent / "audited" / "ours"
-    asked = ["--all", "--policy", "stand", "--out", str(entry)]
+    asked = ["--all", "--policy", "expert", "--out", str(entry)]
     assert main(["audit", str(made.parent / "run"), *asked], factories()) == 0
     for _ in range(2):  # made again, an entry keeps what was filled in
         assert main(["bundle", str(made.parent / "run"), "--out", str(entry)]) == 0
@@ -263,7 +265,7 @@ def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
     assert tomllib.loads((entry / "entry.toml").read_text())["level"] == "re-run"
     code, said, site = build(entry, capsys, "--replay", "16", "--draw", "1")
     assert code == 0 and "ours: re-run, 4 rates" in said, said
-    covered = "audit.json: 16 of 16 episodes played again. That finds any forged line. Policy stand was asked again"
+    covered = "audit.json: 16 of 16 episodes played again. That finds any forged line. Policy expert was asked again"
     assert covered in (site / "ours.html").read_text()
     stated(entry, policy=None, asked=None)
     fill(entry, level="replayed")
@@ -283,6 +285,10 @@ def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
         (lambda entry: repacked(entry, actions_left_out), "gives consistent: bundle.zip: actions of episode "),
         (lambda entry: stated(entry, policy=None), "gives replayed: audit.json: asked is 16 of 16 episodes"),
         (lambda entry: stated(entry, asked=15), "gives replayed: audit.json: asked is 15 of 16 episodes"),
+        (
+            lambda entry: stated(entry, policy="stand"),
+            'replayed: audit.json: policy is "stand", its run has "expert"',
+        ),
         (lambda entry: stated(entry, tolerance=1.0), "gives replayed: audit.json: tolerance is 1, expected at most"),
         (lambda entry: stated(entry, asked="16"), 'audit.json: asked is "16", expected'),
         (lambda entry: stated(entry, played=[-1]), "audit.json: played is [-1], expected"),
@@ -290,7 +296,7 @@ def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
         (lambda entry: (entry / "audit.json").write_text('{"run": {"tolerance": NaN}}'), "NaN is not JSON"),
         (lambda entry: (entry / "audit.json").write_bytes(b"\xff"), "not readable as JSON"),
     ],
-    ids="none head faults nothing repeated picked few unpacked unasked part lax text negative shape nan bytes".split(),
+    ids="none head faults empty repeated picked few unpacked unasked part other lax text low shape nan raw".split(),
 )
 def test_a_level_without_its_evidence_is_refused(audited, tmp_path, forge, named, capsys):
     """An entry that claims more than bundle and audit.json give is one line with file and field, code 2, no page."""
@@ -320,6 +326,48 @@ def test_a_bundle_stays_in_its_folder(entry, capsys):
         code, said, _ = build(entry, capsys)
         assert code == 2 and "is no file of a bundle" in said, said
         assert not list(entry.parent.parent.rglob("escaped.*"))
+
+
+@pytest.mark.parametrize("name", ["other/strips/1.jpg", "actions/99999.npz", "other/episodes.jsonl", "suite.x.jsonl"])
+def test_a_member_of_no_run_is_refused(entry, name, capsys):
+    """A file of a bundle that none of its runs names is refused by its name: nothing would check it."""
+    repacked(entry, lambda members: members.update({name: b"{}"}))
+    code, said, site = build(entry, capsys)
+    assert code == 2 and f'{entry / "bundle.zip"}: "{name}" is of no run in it' in said and not site.exists(), said
+
+
+def test_weights_are_of_a_training(tmp_path, capsys):
+    """A policy whose runs name weights was trained: an entry that says otherwise contradicts them."""
+
+    class Weighty(FakePolicy):
+        def describe(self):
+            return {"name": self.name, "weights": "0123456789ab"}
+
+    flags = ["--task", "football", "--engine", "mujoco", "--repeats", "1", "--policy", "learned"]
+    flags += ["--out", str(tmp_path / "run")]
+    assert main(flags, factories(policy=Weighty)) == 0
+    assert main(["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "ours")]) == 0
+    fill(tmp_path / "ours", **KEYS)
+    code, said, site = build(tmp_path / "ours", capsys)
+    assert code == 1 and 'training_data is "none", the policy of its runs has weights' in said and not site.exists()
+
+
+def test_nothing_else_is_overwritten(made, entry, capsys):
+    """A page that no build wrote stays, and so do results: both folders are refused by their flag."""
+    site = entry.parent / "site"
+    for name in ("index.html", "ours.html"):
+        site.mkdir()
+        (site / name).write_text("<title>Diary</title>")
+        code, said, _ = build(entry, capsys)
+        assert code == 2 and f"--out {site}: {name} is of something else" in said, said
+        assert [path.read_text() for path in site.iterdir()] == ["<title>Diary</title>"]
+        shutil.rmtree(site)
+    assert [build(entry, capsys)[0] for _ in range(2)] == [0, 0]
+    run = made.parent / "run"
+    for out in (run, run / "entry"):
+        assert main(["bundle", str(run), "--out", str(out)]) == 2
+        assert f"--out {out}: is in the results" in capsys.readouterr().err
+    assert not (run / "bundle.zip").exists() and not (run / "entry").exists()
 
 
 def test_what_is_damaged_in_a_bundle_is_named_by_it(entry, capsys):

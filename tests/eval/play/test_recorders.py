@@ -135,7 +135,7 @@ def test_a_metric_that_is_none_is_named(tmp_path, capsys, name, value, says):
 
 
 def test_metrics_of_one_name_are_refused(tmp_path, capsys):
-    """Two metrics of one name, of which a line could hold one, are an error that names both; so is one given twice."""
+    """Two metrics of one name, of which a line could hold one, are an error that names both; so is one twice."""
 
     class Ticks(Metric):
         name = "ticks"
@@ -153,6 +153,9 @@ def test_metrics_of_one_name_are_refused(tmp_path, capsys):
         assert "error: --recorder ticks: given twice" in capsys.readouterr().err
     finally:
         recorders.unregister("ticks")
+    assert main([*RUN, "--recorder", "nope", "--out", str(tmp_path / "b")]) == 2
+    said = capsys.readouterr().err
+    assert "--recorder nope: unknown recorder; known are none: no package is installed that offers one" in said
 
 
 def test_a_metric_that_two_recorders_give_is_refused(tmp_path, capsys):

@@ -484,14 +484,16 @@ def test_two_processes_train_one_network(library, tmp_path, monkeypatch):
 def test_curves(trained, tmp_path, capsys):
     """A picture of one training or several; a folder without a log is named."""
     out, log = tmp_path / "curves.png", str(trained.folder)
-    assert command_line.main(["curves", log, log, "--out", str(out)]) == 0
+    assert command_line.main(["curves", log, f"{log}/progress.jsonl", "--out", str(out)]) == 0
     with Image.open(out) as picture:
         assert picture.width > 1000 and len(set(picture.convert("L").resize((60, 30)).getdata())) > 10
     (tmp_path / "bad.jsonl").write_text("3\n{}\n")
     (tmp_path / "deep.jsonl").write_text("[" * 100_000 + "\n{}\n")
     for arguments, words in (
         (["curves", str(tmp_path / "b")], "b/progress.jsonl: cannot be read"),
-        (["curves"], "name the folders"),
+        (["curves"], "name folders of trainings"),
+        (["curves", log, log], "is named twice"),
+        (["export", log, log], "unknown argument"),
         (["curves", str(tmp_path / "bad.jsonl")], "a logged iteration lacks seconds"),
         (["curves", str(tmp_path / "deep.jsonl")], "deep.jsonl: line 1 is not JSON"),
         (["curves", log, "--out", str(tmp_path / "a.txt")], "expected .png"),
@@ -576,23 +578,15 @@ def test_training_options_have_one_default():
     assert not found
 
 
-@pytest.mark.parametrize(
-    "flags",
-    [
-        ["--worlds", "-1"],
-        ["--keep-last", "-1"],
-        ["--iterations", "0"],
-        ["--minutes", "-1"],
-        ["--minibatches", "1000"],
-        ["--learning-rate", "nan"],
-        ["--families", "walk", "-3"],
-        ["--seed", "-1"],
-        ["--episode-s", "1e30"],
-        ["--rewards", "heading", "nan"],
-    ],
+UNFIT = (
+    "--worlds -1; --keep-last -1; --iterations 0; --minutes -1; --minibatches 1000; --learning-rate nan; --seed -1; "
+    "--families walk -3; --episode-s 1e30; --rewards heading nan; --events; --events push"
 )
+
+
+@pytest.mark.parametrize("flags", map(str.split, UNFIT.split("; ")), ids=" ".join)
 def test_numbers_out_of_range_are_refused_first(flags, tmp_path, capsys):
-    """A number that no training can use is one line with its flag, before references are made."""
+    """A number that no training can use, or none, is one line with its flag, before references are made."""
     log_dir = tmp_path / "log"
     assert command_line.main(["--device", "cpu", "--worlds", "8", "--log-dir", str(log_dir), *flags]) == 2
     message = capsys.readouterr().err
