@@ -49,7 +49,7 @@ class TickDifferences:
     velocities: list[np.ndarray] = field(default_factory=list)
     """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; the last state has none."""
     unmoved: tuple[float, int] = (0.0, 0)
-    """What a lone body got most of while nothing that moves was near, as a part of what it may, and the tick."""
+    """Most that a lone body got while nothing that moves was near, as a part of what it may, and the tick."""
 
     def of_ticks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest difference of a position and of a velocity after each tick."""
