@@ -134,5 +134,5 @@ def bundle(folders: Sequence[Path], options: BundleOptions) -> int:
     write_atomic(out / ENTRY_FILE, entry_text(known, before))
     print(f"bundle: {out / BUNDLE_FILE}, {len(data):,} bytes")
     print(f"entry: {out / ENTRY_FILE}, level {known['level']}; fill in its empty keys")
-    print("then: python -m arena_newton.eval leaderboard build")
+    print(f"then: python -m arena_newton.eval leaderboard build {out}")
     return 0

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from arena_newton.cli.flags import Device, Engine, Several, bounds, check_bounds
 from arena_newton.errors import InputError
+from arena_newton.files.stored_json import check_types
 from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.chunk_flags import LABELS
-from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES
+from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, TrainingRecipe
 
 __all__ = [
     "PolicyTrainOptions",
@@ -197,7 +198,7 @@ def recipe_values(given: Sequence[str]) -> dict[str, object]:
     """Fields of a recipe as they are typed: JSON, or text; those of the network under `network`.
 
     Raises:
-        InputError: One is no field and value, is given twice, or has a flag of its own.
+        InputError: One is no field of a recipe and value of its type, is given twice, or has a flag of its own.
     """
     found: dict[str, object] = {}
     network: dict[str, object] = {}
@@ -214,7 +215,8 @@ def recipe_values(given: Sequence[str]) -> dict[str, object]:
         if fields is found and key in FLAGGED:
             raise InputError(f"--recipe-values {text}: {FLAGGED[key]} says it")
         fields[key] = value
-    return found | ({"network": network} if network else {})
+    typed_fields = found | ({"network": network} if network else {})
+    return check_types("--recipe-values", typed_fields, TrainingRecipe)
 
 
 def _task_numbers(

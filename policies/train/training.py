@@ -16,7 +16,6 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
-from arena_newton.files.stored_json import check_types
 from arena_newton.files.text import counted
 from arena_newton.physics.devices import torch_device
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, vector_of
@@ -204,9 +203,7 @@ def chosen_recipe(options: PolicyTrainOptions) -> TrainingRecipe:
     if options.weights:
         named = with_pretrained(named)
     changes: dict[str, object] = {"lr_backbone": named.lr_backbone}
-    if options.recipe_values:
-        values = recipe_values(options.recipe_values)
-        changes |= check_types("--recipe-values", values, TrainingRecipe)
+    changes |= recipe_values(options.recipe_values)
     if options.labels:
         changes["labels"] = options.labels
         # Integrated yaw rates drift; a recipe of v3.1 says nothing of it.

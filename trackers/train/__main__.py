@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.command_line import INTERRUPTED, exit_code, program
 from arena_newton.cli.command_table import HELP
 from arena_newton.cli.flags import folders_named, parse_flags
 from arena_newton.trackers.train.train_options import CurveOptions, ExportOptions, TrainOptions, check
@@ -28,10 +28,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
 
-    def work() -> None:
+    def work() -> int:
         if arguments and arguments[0] in ("export", "curves"):
             (_export if arguments[0] == "export" else _curves)(arguments[1:])
-            return
+            return 0
         options = parse_flags(TrainOptions, arguments, PROG)
         check(options)  # before the libraries are loaded
         from arena_newton.cli.quiet import quiet_warp
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with without_wandb(options.logger):
             from arena_newton.trackers.train.session import train
         quiet_warp()
-        train(options)
+        return INTERRUPTED if train(options).interrupted else 0
 
     return exit_code(work)
 

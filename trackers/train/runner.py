@@ -112,7 +112,8 @@ class TrackerRunner(OnPolicyRunner):
         """Seconds of training, before resuming included."""
         self.critic_iterations = 20
         """Iterations of the critic alone, in a training that starts from given weights."""
-        self._stop = False
+        self.interrupted = False
+        """Whether a signal ended the training."""
         self._started = False
         self._resumed: Path | None = None
 
@@ -166,9 +167,9 @@ class TrackerRunner(OnPolicyRunner):
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
         """SIGTERM and Ctrl-C end the training after this iteration; a second Ctrl-C ends it at once."""
-        if self._stop and number == signal.SIGINT:
+        if self.interrupted and number == signal.SIGINT:
             raise KeyboardInterrupt
-        self._stop = True
+        self.interrupted = True
         if number == signal.SIGINT and not self.logger.disable_logs:
             print("\nstopping after this iteration; a second Ctrl-C stops without writing", flush=True)
 
@@ -276,7 +277,7 @@ class TrackerRunner(OnPolicyRunner):
 
     def _agree(self, elapsed: float) -> tuple[bool, float]:
         """Agree on whether to stop and on the passed fraction of the time limit: the same answer in every process."""
-        stop = float(self._stop)
+        stop = float(self.interrupted)
         if self.is_distributed:
             answers = torch.tensor([stop, elapsed], dtype=torch.float64, device=self.device)
             torch.distributed.all_reduce(answers, torch.distributed.ReduceOp.MAX)

@@ -20,7 +20,7 @@ from lerobot.scripts import lerobot_train
 from arena_newton.data.readers.label_protocols import LABELS
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, TrainingRecipe, paper_file, recipe
-from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
 from arena_newton.policies.train.training import chosen_recipe
 
 TABLE = {
@@ -214,6 +214,8 @@ def test_values_of_a_recipe_are_flags():
     assert found.network == {**usual.network, "dim_model": 128}
     same = {"frozen_norms": 0.3, "shift_px": usual.shift_px, "schedule": "cosine", "network": usual.network}
     assert replace(found, **same) == usual
+    with pytest.raises(InputError, match="--recipe-values: nope is not an option"):
+        check_numbers(PolicyTrainOptions(recipe_values=("nope=1",)))  # before the libraries are loaded
 
 
 @pytest.mark.parametrize(

@@ -390,7 +390,7 @@ def signalled(env, monkeypatch, *numbers: int) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_training_with_its_files(env, still, tmp_path, number, monkeypatch):
-    """The iteration in flight is finished, logged and written."""
+    """The iteration in flight is finished, logged and written, and the command's code is that of an interruption."""
     runner = make_runner(env, tmp_path, log_interval=100)
     signalled(env, monkeypatch, number)
     runner.learn(50)
@@ -398,6 +398,8 @@ def test_a_signal_ends_the_training_with_its_files(env, still, tmp_path, number,
     assert [json.loads(line)["iteration"] for line in (tmp_path / "progress.jsonl").read_text().splitlines()] == [1, 2]
     assert not (tmp_path / "git").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.setattr("arena_newton.trackers.train.session.train", lambda options: runner)
+    assert command_line.main(["--device", "cpu", "--log-dir", str(tmp_path / "log")]) == 130
 
 
 def test_a_second_interrupt_stops_at_once(env, still, monkeypatch):
