@@ -129,7 +129,7 @@ class TrackerLoop:
         self._late: tuple[Delay, Delay] | None = None
         """Latencies of the tracker's state and of the joint targets; None until a world has one."""
         self.measured: Callable[[RobotState], RobotState] | None = None
-        """What the sensors make of the state that the tracker gets; None: they are exact."""
+        """Sensors, which change the state that the tracker gets; None: they are exact."""
         self.lookahead: int = getattr(tracker, "lookahead", 0)
         """Coming references that the tracker reads [ticks]."""
         self._give(getattr(tracker, "needs", ()))

@@ -130,7 +130,7 @@ class Known:
 
     names: Callable[[], Collection[str]]
     made: Callable[[Json], bool] = lambda value: False
-    """Whether it is made of one of them by rule."""
+    """Test of a text that is made of one of them by rule."""
 
     def test(self, value: Json) -> bool:
         """True if a text is one of the names, or made of one."""

@@ -27,7 +27,7 @@ MOST_LATENCY = 10
 MOST_LETTERS = 100
 """Longest name of a mode with quantities added to it, which names files too."""
 PLUS, TO = "+", ".."
-"""What adds a quantity to a mode's name, and what stands between the ends of its range."""
+"""Signs before a quantity that a mode's name adds, and between the ends of its range."""
 _NUMBER = r"(-?[0-9]{1,9}(?:\.[0-9]{1,9})?)"
 _ADDED = re.compile(rf"([a-z_]+)={_NUMBER}(?:{re.escape(TO)}{_NUMBER})?")
 
