@@ -23,7 +23,7 @@ from arena_newton.eval.audit.claimed_conditions import (
 )
 from arena_newton.eval.audit.draws import odds
 from arena_newton.eval.audit.folder_audit import ENGINE, Audit
-from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, StatesAgain, TickDifferences
+from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, STILL, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
 from arena_newton.eval.plan.episode_plan import Episode
@@ -344,6 +344,10 @@ def _compare_ticks(
     if found.states <= min(record.steps, result.steps):
         few = counted(max(found.states - 1, 0), "tick")
         audit.faults.append(f"{where}: states of its first {few} alone are recorded")
+    worst, at = found.unmoved
+    if worst > tolerances[1]:
+        got = f"{worst * STILL:.2g} m/s or m that {ENGINE} does not give"
+        audit.faults.append(f"{where}: until tick {at} a body that nothing moved got {got}")
     for ticks, factor, largest in ((1, 1.0, found.of_ticks()), (SECOND, DRIFT, found.of_seconds())):
         for name, differences, tolerance in zip(("positions", "velocities"), largest, tolerances, strict=True):
             if (worst := float(differences.max())) > factor * tolerance:

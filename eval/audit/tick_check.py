@@ -16,7 +16,7 @@ from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 
-__all__ = ["EPISODE", "SECOND", "START", "StatesAgain", "TickDifferences", "surface_radii"]
+__all__ = ["EPISODE", "SECOND", "START", "STILL", "LoneBodies", "StatesAgain", "TickDifferences", "surface_radii"]
 
 EPISODE = "episode"
 """Name of the recording of an episode among its media."""
@@ -25,6 +25,15 @@ START = 0.01
 
 SECOND = 50
 """Ticks whose differences are also added up: a small one that always points the same way moves a body in time."""
+
+STILL = 0.05
+"""Horizontal speed [m/s] that a lone body may gain, and distance [m] that it may move, while nothing moving is near."""
+GAINED = 0.1
+"""Part of its speed, on top: engines differ by some percent in how a kicked ball's sliding becomes rolling."""
+NEAR = 0.05
+"""Distance of the bounding spheres of two bodies within which they may touch during a tick [m]."""
+ROLLED = 0.4
+"""Speed of a ball's centre that friction trades for a unit of speed of its surface."""
 
 
 @dataclass
@@ -39,6 +48,8 @@ class TickDifferences:
     """Differences of all bodies after each tick [m], each of shape [bodies, 3]."""
     velocities: list[np.ndarray] = field(default_factory=list)
     """Differences of all degrees of freedom [m/s, rad/s], each of shape [nv]; the last state has none."""
+    unmoved: tuple[float, int] = (0.0, 0)
+    """Most that a lone body got while nothing that moves was near, as a part of what it may, and the tick."""
 
     def of_ticks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest difference of a position and of a velocity after each tick."""
@@ -75,6 +86,61 @@ def surface_radii(model: mujoco.MjModel) -> np.ndarray:
     return factors
 
 
+class LoneBodies:
+    """Sums of differences of bodies that move freely by themselves, since something that moves was last near each.
+
+    A tick's tolerance is as wide as a kick; without this a ball that lies could be kicked by nobody within it.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        """Know where they are in a scene's state."""
+        trees = model.body_treeid
+        reach = np.zeros(model.nbody)
+        np.maximum.at(reach, model.geom_bodyid, np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound)
+        self._reach = reach
+        joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        joints = joints[model.tree_dofnum[trees[model.jnt_bodyid[joints]]] == 6]
+        self._bodies = model.jnt_bodyid[joints]
+        self._dofs = model.jnt_dofadr[joints]
+        self._others = [(trees == trees[body], (trees >= 0) & (trees != trees[body])) for body in self._bodies]
+        self._sums, self._fastest = np.zeros((3, len(joints), 2)), np.zeros(len(joints))
+
+    def worst(
+        self,
+        before: np.ndarray,
+        after: np.ndarray,
+        moved: np.ndarray,
+        gained: np.ndarray,
+        speed: np.ndarray,
+        quats: np.ndarray,
+    ) -> float:
+        """Largest sum now, as a part of what is allowed.
+
+        Args:
+            before: Recorded positions of the bodies before the tick, shape [nbody, 3].
+            after: The same after it.
+            moved: Differences of positions after it, shape [nbody, 3].
+            gained: Differences of velocities after it, of spin at the surface, shape [nv].
+            speed: Recorded velocities after it, shape [nv].
+            quats: Recorded orientations after it, wxyz, shape [nbody, 4].
+        """
+        for k, (own, others) in enumerate(self._others):
+            if any(self._close(at, own, others) for at in (before, after)):
+                self._sums[:, k], self._fastest[k] = 0.0, 0.0
+                continue
+            dof, body, spin = self._dofs[k], self._bodies[k], np.empty(3)
+            mujoco.mju_rotVecQuat(spin, gained[dof + 3 : dof + 6], quats[body])
+            self._sums[:, k] += moved[body, :2], gained[dof : dof + 2], ROLLED * spin[:2]
+            self._fastest[k] = max(self._fastest[k], float(np.linalg.norm(speed[dof : dof + 2])))
+        length = np.linalg.norm(self._sums, axis=2)
+        length[1:] -= GAINED * self._fastest
+        return float(length.max(initial=0.0)) / STILL
+
+    def _close(self, at: np.ndarray, own: np.ndarray, others: np.ndarray) -> bool:
+        apart = np.linalg.norm(at[own][:, None] - at[others], axis=2)
+        return bool((apart < self._reach[own][:, None] + self._reach[others] + NEAR).any())
+
+
 @dataclass
 class _Recorded:
     """Recorded states of an episode."""
@@ -86,6 +152,9 @@ class _Recorded:
     """Before each tick, shape [ticks, nv]."""
     radii: np.ndarray
     """Radii of spin, shape [nv] (`surface_radii`)."""
+    lone: LoneBodies
+    bodies: np.ndarray
+    """Positions of the bodies in the recorded state before, shape [nbody, 3]."""
 
 
 class StatesAgain(Recorder):
@@ -109,7 +178,8 @@ class StatesAgain(Recorder):
         velocities = file.array("arena_qvel", len(positions), model.nv)
         if not len(velocities):
             raise InputError(f"{file.path}: arena_qvel holds no tick")
-        self._states[world] = _Recorded(episode.index, np.vstack([positions, last]), velocities, surface_radii(model))
+        states, radii, bodies = np.vstack([positions, last]), surface_radii(model), np.zeros((model.nbody, 3))
+        self._states[world] = _Recorded(episode.index, states, velocities, radii, LoneBodies(model), bodies)
         self.differences[episode.index] = TickDifferences()
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
@@ -134,7 +204,12 @@ class StatesAgain(Recorder):
         env.physics.put(world, mine.positions[tick], mine.velocities[last])
         if found.states:
             found.positions.append(bodies - given)
-            found.velocities += [(mine.velocities[tick] - moving) * mine.radii] if tick == last else []
+            if tick == last:
+                gained, quats = (mine.velocities[tick] - moving) * mine.radii, env.physics.xquat.numpy()[world]
+                found.velocities.append(gained)
+                near = mine.bodies, bodies, bodies - given
+                worst = mine.lone.worst(*near, gained, mine.velocities[tick], quats.astype(np.float64))
+                found.unmoved = max(found.unmoved, (worst, tick - 1), key=lambda one: one[0])
         else:
             found.first = float(np.abs(bodies - given).max())
-        found.states += 1
+        found.states, mine.bodies = found.states + 1, bodies.astype(np.float64)

@@ -113,7 +113,7 @@ class TrackerRunner(OnPolicyRunner):
         self.critic_iterations = 20
         """Iterations of the critic alone, in a training that starts from given weights."""
         self.interrupted = False
-        """True once a signal ended the training."""
+        """True if a signal ended the training."""
         self._started = False
         self._resumed: Path | None = None
 

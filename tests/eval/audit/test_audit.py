@@ -411,13 +411,14 @@ def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
     with np.load(path) as stored:
         arrays = dict(stored)
     ticks = len(arrays["arena_qvel"])
-    for name, by, said in (
-        ("arena_qvel", 2.0 * (np.arange(ticks) == 7), "m/s or rad/s from what mujoco gives"),
-        ("arena_qpos", 0.003 * np.arange(ticks), "positions added up over a second from tick 0 on are 0.0"),
-        ("arena_qpos", 0.05 * (np.arange(ticks) >= 7), "positions after tick 6 are 0.05 m from what mujoco gives"),
+    for name, at, by, said in (
+        ("arena_qvel", 0, 2.0 * (np.arange(ticks) == 7), "m/s or rad/s from what mujoco gives"),
+        ("arena_qvel", -5, 0.9 * (np.arange(ticks) == 7), "until tick 6 a body that nothing moved got 0.8"),
+        ("arena_qpos", 0, 0.003 * np.arange(ticks), "positions added up over a second from tick 0 on are 0.0"),
+        ("arena_qpos", 0, 0.05 * (np.arange(ticks) >= 7), "positions after tick 6 are 0.05 m from what mujoco gives"),
     ):
         forged = {name: arrays[name].copy(), "arena_final_qpos": arrays["arena_final_qpos"].copy()}
-        forged[name][:, 0] += by
+        forged[name][:, at] += by
         forged["arena_final_qpos"][0] += by[-1] * (name == "arena_qpos")
         np.savez_compressed(path, **arrays | forged)
         assert main(["audit", str(run), "--all"], parts) == 1
