@@ -85,8 +85,19 @@ class Mode:
         """Check the ranges.
 
         Raises:
-            InputError: An unknown quantity, a range that is none, or layers of a mode that takes none.
+            InputError: A field of another kind, an unknown quantity, a range that is none, or layers of a mode that
+                takes none.
         """
+        kinds = {
+            "placements": (callable(self.placements), "a function of an object's rule"),
+            "scene": (self.scene in ("base", "semantic", "layer"), "base, semantic or layer"),
+            "layers": (self.layers is None or isinstance(self.layers, Path), "a Path or None"),
+            "light": (self.light is None or callable(self.light), "a function of a rule set or None"),
+            "dynamics": (isinstance(self.dynamics, Mapping), "ranges by name"),
+        }
+        for name, (fit, expected) in kinds.items():
+            if not fit:
+                raise InputError(f"mode {self.name}: {name} is {getattr(self, name)!r}, expected {expected}")
         if self.layers is not None and self.scene != "layer":
             raise InputError(f"mode {self.name}: has layers, but its scene is {self.scene!r}, expected 'layer'")
         for name, (low, high) in self.dynamics.items():

@@ -82,6 +82,13 @@ def won(line: Line) -> None:
     line["events"] = [event for event in line["events"] if event["kind"] != "fall"]
 
 
+def with_predicate(folder: Path, lines: list[Line]) -> None:
+    """The first predicate of a timeout said to have held in its second tick, with the progress of all that did."""
+    line = first(lines, "timeout")
+    line["predicates"] = held = line["predicates"] | {next(iter(line["predicates"])): 2}
+    line["progress"] = sum(tick is not None for tick in held.values()) / len(held)
+
+
 def all_won(folder: Path, lines: list[Line]) -> None:
     """Every failure made a success."""
     lost = [line for line in lines if line["outcome"] != "success"]
@@ -308,11 +315,7 @@ FORGERIES: dict[str, Forgery] = TABLES | {
     "a predicate renamed": edited("timeout", predicates={"goal": None}),
     "a predicate after the end": edited("timeout", predicates=lambda line: line["predicates"] | {"approach": 9999}),
     "progress": edited("timeout", progress=0.75),
-    "a predicate and progress": edited(
-        "timeout",
-        predicates=lambda line: line["predicates"] | {next(iter(line["predicates"])): 2},
-        progress=lambda line: 1 / len(line["predicates"]),
-    ),
+    "a predicate and progress": with_predicate,
     "event of the fall removed": edited("fall", events=[]),
     "fall moved past the end": edited("fall", events=[{"kind": "fall", "tick": 99999, "detail": "tilt"}]),
     "fall at the start": edited("fall", startup_fall=True),

@@ -66,6 +66,8 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
         raise InputError(f"leaderboard: two entries of one name, or one named index: {' '.join(map(str, entries))}")
     if options.replay and options.draw is None:
         raise InputError("--replay: draws episodes by a number that nobody could know; give one by --draw")
+    if options.draw is not None and not options.replay:
+        raise InputError("--draw: draws the episodes of --replay; add it")
     out = user_path(options.out)
     with tempfile.TemporaryDirectory() as scratch:
         found = []

@@ -27,7 +27,8 @@ SIMULATOR = "arena_newton"
 UNTRAINED = "none"
 """Training data of a policy that was not trained."""
 
-Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(re.fullmatch(r"\d{4}-\d\d(?:-\d\d)?", v)))]
+_DATE = re.compile(r"\d{4}-(?:0[1-9]|1[0-2])(?:-(?:0[1-9]|[12]\d|3[01]))?")
+Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(_DATE.fullmatch(v)))]
 Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]
 Level = Annotated[str, Known(lambda: tuple(LEVELS))]
 Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v))]

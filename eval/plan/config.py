@@ -47,7 +47,7 @@ from arena_newton.eval.records.identity import (
 from arena_newton.eval.records.sharding import Shard, dealt, parse_shard
 from arena_newton.files.stored_json import JsonObject
 from arena_newton.files.text import counted, plain_text
-from arena_newton.physics.devices import cluster_engine, resolve_engine
+from arena_newton.physics.devices import cluster_engine, resolve_engine, visible_gpus
 from arena_newton.pictures.settings import (
     CAMERAS,
     SIZE_LIMITS,
@@ -375,7 +375,8 @@ def resolve(options: RunOptions) -> RunConfig:
         policy_hash = config_hash([hash_path(file) for file in program.decisive])
     variant_hash = layers_hash(variant) if variant else None
     if options.dealt:
-        engine, device = cluster_engine(options.engine, options.device, options.ray_gpus)
+        alone = options.ray is None and options.device is None and not visible_gpus()  # what --jobs starts sees no more
+        engine, device = cluster_engine(options.engine, "cpu" if alone else options.device, options.ray_gpus)
     else:
         engine, device = resolve_engine(options.engine, options.device)  # last: it may have to load Warp
     return RunConfig(

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 import warp as wp
 
+from arena_newton import tasks
 from arena_newton.cli.command_line import INTERRUPTED
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
@@ -57,7 +58,7 @@ from arena_newton.policies.base import Policy, PolicyUnavailable
 from arena_newton.policies.label_reader import read_by
 from arena_newton.robot.g1 import TICK
 from arena_newton.rollout import Rollout
-from arena_newton.rules import seeding
+from arena_newton.rules import modes, seeding
 
 if TYPE_CHECKING:
     from arena_newton.data.recording.demonstration import DemonstrationRecorder
@@ -109,7 +110,7 @@ def _played(folder: ResultsFolder, factories: Factories) -> bool:
 
 
 def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
-    """Build trackers and policy and check plan and variant, so that wrong input shows before the first episode.
+    """Build trackers and policy and check plan and layers, so that wrong input shows before the first episode.
 
     Returns:
         The configuration with what they say of themselves, and the policy.
@@ -121,6 +122,9 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
         policy.check_task(task, mode, [seeding.policy_seed(episode.episode_seed) for episode in group])
     if config.variant is not None:
         factories.check_variant(config.variant, config.flags.task[0])
+    for task, mode in sorted({(episode.task, episode.mode) for episode in config.episodes}):
+        if modes.get(mode).layers is not None and (layer := tasks.get(task).own_layer(mode)) is not None:
+            factories.check_variant(layer, task)
     config = config.with_parts(made, policy)
     late, chunk = config.flags.latency_ticks, getattr(policy, "chunk_size", 1)
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show

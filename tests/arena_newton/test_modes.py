@@ -99,10 +99,15 @@ def test_a_mode_of_another_package_brings_layers(monkeypatch, tmp_path):
         ({"dynamics": {"object_mass": (0.0, 1.0)}}, "mode wet: object_mass: 0 to 1 is not a range of it"),
         ({"dynamics": {"push_time": (0.5, 1.5)}}, "mode wet: push_time: 0.5 to 1.5 is not a range of it"),
         ({"dynamics": {"state_latency": (0, 11)}}, "mode wet: state_latency: 11, expected at most 10 ticks"),
+        ({"scene": "layers"}, "mode wet: scene is 'layers', expected base, semantic or layer"),
+        ({"scene": "layer", "layers": "/tmp"}, "mode wet: layers is '/tmp', expected a Path or None"),
+        ({"placements": None}, "mode wet: placements is None, expected a function of an object's rule"),
+        ({"light": 3}, "mode wet: light is 3, expected a function of a rule set or None"),
+        ({"dynamics": ["friction"]}, "mode wet: dynamics is .'friction'., expected ranges by name"),
     ],
 )
-def test_ranges_that_are_none_are_refused(change, message):
-    """An unknown quantity, reversed or endless bounds, no mass, part of a tick, a time after the end: one line."""
+def test_fields_and_ranges_that_are_none_are_refused(change, message):
+    """A field of another kind, an unknown quantity, bad bounds, no mass, part of a tick, a late time: one line."""
     with pytest.raises(InputError, match=message):
         dataclasses.replace(WET, **change)
 

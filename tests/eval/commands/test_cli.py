@@ -24,6 +24,8 @@ from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play import run
 from arena_newton.eval.suites.suite_options import MatrixOptions
 from arena_newton.policies.learned import learned_card
+from arena_newton.rules import modes
+from arena_newton.rules.modes import Mode
 from arena_newton.tasks import football
 
 TASKS = ["football", "double_desk", "pp_box", "open_door", "sit_sofa", "boxing", "vis_navi"]
@@ -185,8 +187,8 @@ def test_bad_input_gets_one_line(tmp_path, monkeypatch, capsys, flags, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_variant_is_looked_into(tmp_path, capsys):
-    """A variant file with a fault, or without its one task, is refused before the first episode."""
+def test_variant_is_looked_into(tmp_path, capsys, monkeypatch):
+    """A variant or a mode's layer with a fault, and a variant without its one task, are refused before an episode."""
     variant = tmp_path / "room.usda"
     variant.write_text("#usda 1.0\n")
     out = ["--out", str(tmp_path / "o")]
@@ -196,6 +198,12 @@ def test_variant_is_looked_into(tmp_path, capsys):
 
     assert main([*SHORT, "--variant", str(variant), *out], factories(check_variant=refuse)) == 2
     assert "/World/Ball: missing in a scene of football" in capsys.readouterr().err
+    night = Mode(name="night", sentence="it is dark", scene="layer", layers=tmp_path)
+    monkeypatch.setitem(modes._MODES._registered, "night", night)
+    variant.rename(tmp_path / "football.usda")
+    assert main([*SHORT, "--mode", "night", *out], factories(check_variant=refuse)) == 2
+    assert "football.usda: /World/Ball: missing in a scene of football" in capsys.readouterr().err
+    variant.write_text("#usda 1.0\n")
     assert main(["--task", "all", "--engine", "mujoco", "--variant", str(variant), *out], factories()) == 2
     assert "--task" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()

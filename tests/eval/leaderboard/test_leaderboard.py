@@ -89,6 +89,8 @@ def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
     """Bundle, build and page: rates, replays and the bundle are shown, all links are there; no entry is replaced."""
     assert main(["leaderboard", "build", str(entry), "--replay", "2"], factories()) == 2
     assert "give one by --draw" in capsys.readouterr().err
+    assert main(["leaderboard", "build", str(entry), "--draw", "2"], factories()) == 2
+    assert "--draw: draws the episodes of --replay; add it" in capsys.readouterr().err
     code, said, site = build(entry, capsys, "--replay", "2", "--draw", "7")
     assert code == 0 and "consistent, 4 rates" in said, said
     text = (site / "ours.html").read_text()
@@ -147,6 +149,7 @@ def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
     [
         ({"name": ""}, 'name is "", expected a name'),
         ({"date": "yesterday"}, "date is"),
+        ({"date": "2026-13-01"}, "date is"),
         ({"training_data": "secret"}, "training_data is"),
         ({"level": "proved"}, "level is"),
         ({"trackers": "twist2"}, "trackers is"),

@@ -253,3 +253,4 @@ def test_engine_of_a_cluster(monkeypatch, tmp_path):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
         assert devices.visible_gpus() == seen
         assert devices.cluster_engine("auto", None, None) == (("warp", "cuda:0") if seen else ("mujoco", "cpu"))
+    assert resolve(RunOptions(task=("football",), engine="warp", jobs=2)).device == "cpu", "GPUs of others are not its"
