@@ -24,7 +24,7 @@ from arena_newton.kernels import tick as kernels
 from arena_newton.kernels.launching import record
 from arena_newton.kernels.rules import fall
 from arena_newton.physics.devices import resolve_engine
-from arena_newton.physics.dynamics import Delay, value_of
+from arena_newton.physics.dynamics import NOISES, Delay, SensorNoise, value_of
 from arena_newton.physics.engines import make_physics
 from arena_newton.physics.scene import load_scene
 from arena_newton.pictures.camera import Camera, WorldLights
@@ -145,6 +145,8 @@ class ArenaEnv:
         """Random numbers drawn for each world's episode."""
         self._late: Delay | None = None
         """Latency of the policy's state; None until a world has one."""
+        self._noise: SensorNoise | None = None
+        """Noise of the sensors; None until a world has some."""
         self._push_tick = np.full(self.worlds, NO_TICK)
         """Tick before which each world is pushed."""
         self.planning = ""
@@ -286,7 +288,7 @@ class ArenaEnv:
                     qpos[k, address + 3 : address + 7] = placed.quat
             if self._lights is not None:
                 self._lights.set(world, draws.light)
-        self._set_dynamics(rows)
+        self._set_dynamics(rows, seeds)
         p.reset_worlds(rows, qpos, mocap_pos, mocap_quat)
         mask = self._mask(rows)
         self.loop.fresh(mask, prefill=self.rules.startup.prefill)
@@ -299,14 +301,21 @@ class ArenaEnv:
         self.active[rows] = True
         self._anchored[rows] = False
 
-    def _set_dynamics(self, rows: np.ndarray) -> None:
+    def _set_dynamics(self, rows: np.ndarray, seeds: Sequence[int]) -> None:
         """Give worlds the dynamics that were drawn for their episodes; without any, those of the scene."""
         samples = [draws.dynamics if (draws := self.draws[world]) is not None else {} for world in rows.tolist()]
         self.physics.set_dynamics(rows, samples)
         self.loop.delay(rows, samples)
         if self._late is None and any(samples):
             self._late = Delay(self.worlds, STATE_WIDTH, self.torch_device)
-        for world, sample in zip(rows.tolist(), samples, strict=True):
+        if self._noise is None and any(value_of(sample, name) > 0.0 for sample in samples for name in NOISES):
+            noise = self._noise = SensorNoise(self.worlds, self.torch_device)
+            self.loop.measured = lambda state: noise.on_robot(state, self.tick)
+        for seed, world, sample in zip(seeds, rows.tolist(), samples, strict=True):
+            if self._noise is not None:
+                self._noise.set(world, int(seed), sample)
+            if value_of(sample, "picture_noise") > 0.0 and not self.cameras:
+                raise InputError(f"mode {self.modes[world]}: picture_noise, but the policy wants no picture")
             if self._late is not None:
                 self._late.ticks[world] = int(value_of(sample, "state_latency"))
             pushed = value_of(sample, "push") > 0.0
@@ -358,11 +367,16 @@ class ArenaEnv:
         self._anchor(self.active)
         self._observe()
         state = self._state if self._late is None else self._late.late(self._state)
+        if self._noise is not None:
+            state = self._noise.on_state(state, self.tick)
         images, depths = dict[str, torch.Tensor](), dict[str, torch.Tensor]()
         if image and not self.cameras:
             raise InputError("the policy needs images, but the environment was built without a camera")
         for name, camera in self.cameras.items() if image else ():
             images[name] = self.render(camera, mask)
+            if self._noise is not None:
+                asked = np.ones(self.worlds, dtype=bool) if mask is None else mask
+                images[name] = self._noise.on_picture(name, images[name], asked, self.tick)
             if self.camera_configs[name].depth:
                 depths[name] = camera.distance_picture().half()
         return Observation(

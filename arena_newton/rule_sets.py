@@ -232,8 +232,8 @@ def markdown() -> str:
         for things in [" and ".join(path.removeprefix("/World/") for path in (case.first, case.second))]
     ]
     drawn = [
-        (f"`{name}`", _span(bounds), QUANTITIES[name].unit, QUANTITIES[name].sentence)
-        for name, bounds in BUILT_IN[DYNAMICS].dynamics.items()
+        (f"`{name}`", _span(BUILT_IN[DYNAMICS].dynamics.get(name)), quantity.unit, quantity.sentence)
+        for name, quantity in QUANTITIES.items()
     ]
     head = ("task", "things", "`--rules`", "`--mode`", "episodes of 60", "deepest [m]", "because")
     lines = [
@@ -251,7 +251,9 @@ def markdown() -> str:
         "",
         *Table(("`--mode`", "change"), [(f"`{mode.name}`", mode.sentence) for mode in BUILT_IN.values()]).compact(),
         "",
-        "`dynamics` draws these once per episode, each by a generator of its own, under both rule sets:",
+        "`dynamics` draws those with a range once per episode, each by a generator of its own, under both rule sets.",
+        "`+name=value` and `+name=low..high` behind a mode's name draw any of them, as `--mode base+push=0.5`; a push",
+        "that is named alone has the time and heading of `dynamics`:",
         "",
         *Table(("quantity", "range", "unit", "meaning"), drawn).compact(),
         "",

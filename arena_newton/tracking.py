@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -128,6 +128,8 @@ class TrackerLoop:
         physics."""
         self._late: tuple[Delay, Delay] | None = None
         """Latencies of the tracker's state and of the joint targets; None until a world has one."""
+        self.measured: Callable[[RobotState], RobotState] | None = None
+        """Sensors, which change the state that the tracker gets; None: they are exact."""
         self.lookahead: int = getattr(tracker, "lookahead", 0)
         """Coming references that the tracker reads [ticks]."""
         self._give(getattr(tracker, "needs", ()))
@@ -305,6 +307,8 @@ class TrackerLoop:
         if self.lookahead:
             self._look_ahead()
         state = self._late_state(ticking)
+        if self.measured is not None:
+            state = self.measured(state)
         first = self._prefill & mask
         if first.any():
             self.tracker.prefill(command, state, self._chosen.choose(first).torch)

@@ -18,7 +18,7 @@ from arena_newton.differentiable.kernel_gradients import ReferenceState, referen
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
 from arena_newton.kernels import tick as codes
-from arena_newton.physics.dynamics import value_of
+from arena_newton.physics.dynamics import NOISES, value_of
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.physics.policy_view import PolicyView
 from arena_newton.pictures.settings import policy_cameras
@@ -112,7 +112,7 @@ def closed_loop(
         env.release(range(env.worlds))
 
 
-_WITHOUT = ("state_latency", "action_latency", "push")
+_WITHOUT = ("state_latency", "action_latency", "push", *NOISES)
 """Dynamics of an episode that are not part of the loop."""
 
 

@@ -129,10 +129,12 @@ class Known:
     """A stored value is one of these names."""
 
     names: Callable[[], Collection[str]]
+    made: Callable[[Json], bool] = lambda value: False
+    """Test of a text that is made of one of them by rule."""
 
     def test(self, value: Json) -> bool:
-        """True if a text is one of the names."""
-        return value in self.names()
+        """True if a text is one of the names, or made of one."""
+        return value in self.names() or self.made(value)
 
 
 def is_name(value: Json) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -10,12 +11,23 @@ import mujoco
 import numpy as np
 import torch
 
+from arena_newton.interfaces import RobotState
+from arena_newton.robot.canonical import STATE
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO, MUJOCO_JOINTS
+from arena_newton.robot.rotations import matrix_from_quat, quat_multiply
+from arena_newton.rules import seeding
 from arena_newton.rules.modes import MOST_LATENCY, QUANTITIES
 
 if TYPE_CHECKING:
     from arena_newton.tasks.handles import RobotHandles
 
-__all__ = ["Delay", "value_of", "varied"]
+__all__ = ["NOISES", "Delay", "SensorNoise", "value_of", "varied"]
+
+_JOINTS = len(MUJOCO_JOINTS)
+_MEASURED = {"joint_pos_noise": _JOINTS, "joint_vel_noise": _JOINTS, "gyro_noise": 3, "orientation_noise": 3}
+"""Noise on the robot's state, and how many numbers it changes."""
+NOISES = (*_MEASURED, "picture_noise")
+"""Quantities that are noise of the sensors."""
 
 
 def value_of(sample: Mapping[str, float], name: str) -> float:
@@ -73,3 +85,74 @@ class Delay:
         late = self.late(now).split([part.shape[1] for part in parts.values()], 1)
         self.keep(now, mask)
         return dict(zip(parts, late, strict=True))
+
+
+class SensorNoise:
+    """White noise on what policy and tracker are shown, by an episode's seed and its tick alone.
+
+    At one tick both see the same; latency is before it. Worlds without noise keep every bit.
+    """
+
+    def __init__(self, worlds: int, device: torch.device):
+        """Disturb no world."""
+        self._deviations = np.zeros((worlds, sum(_MEASURED.values())))
+        self._pictures = np.zeros(worlds)
+        self._seeds: list[int] = [0] * worlds
+        self._drawn_at = np.full(worlds, np.iinfo(np.int64).min)
+        self._drawn = np.zeros(self._deviations.shape, np.float32)
+        self._device = device
+        self._order = torch.tensor(CANONICAL_TO_MUJOCO, device=device)
+
+    def set(self, world: int, seed: int, sample: Mapping[str, float]) -> None:
+        """Give a world the noise of its episode."""
+        parts = [np.full(width, value_of(sample, name)) for name, width in _MEASURED.items()]
+        self._deviations[world] = np.concatenate(parts)
+        self._pictures[world] = value_of(sample, "picture_noise")
+        self._seeds[world], self._drawn_at[world] = seed, np.iinfo(np.int64).min
+
+    def _draws(self, ticks: np.ndarray) -> tuple[torch.Tensor, ...]:
+        """Worlds with noise, shape [worlds, 1], and that of their tick: positions, velocities, gyro, a quaternion."""
+        noisy = self._deviations.any(axis=1)
+        for world in np.flatnonzero(noisy & (self._drawn_at != ticks)).tolist():
+            rng = seeding.sensor_rng(self._seeds[world], int(ticks[world]))
+            self._drawn[world] = rng.standard_normal(self._drawn.shape[1]) * self._deviations[world]
+        self._drawn_at[:] = ticks
+        drawn = torch.from_numpy(self._drawn.copy()).to(self._device)
+        position, velocity, gyro, turn = drawn.split([*_MEASURED.values()], 1)
+        half = 0.5 * turn
+        angle = half.norm(dim=1, keepdim=True)
+        quat = torch.cat((torch.cos(angle), half * torch.sinc(angle / np.pi)), 1)
+        return torch.from_numpy(noisy)[:, None].to(self._device), position, velocity, gyro, quat
+
+    def on_robot(self, state: RobotState, ticks: np.ndarray) -> RobotState:
+        """The state that a tracker gets at these ticks of the worlds; position and base velocity stay exact."""
+        noisy, position, velocity, gyro, turn = self._draws(ticks)
+        return dataclasses.replace(
+            state,
+            quat=torch.where(noisy, quat_multiply(state.quat, turn), state.quat),
+            ang_vel_body=torch.where(noisy, state.ang_vel_body + gyro, state.ang_vel_body),
+            joint_pos=torch.where(noisy, state.joint_pos + position, state.joint_pos),
+            joint_vel=torch.where(noisy, state.joint_vel + velocity, state.joint_vel),
+        )
+
+    def on_state(self, state: torch.Tensor, ticks: np.ndarray) -> torch.Tensor:
+        """The state 64 that a policy gets at these ticks of the worlds."""
+        noisy, position, velocity, _, turn = self._draws(ticks)
+        x, y = state[:, STATE["root_rot6d"]].reshape(-1, 3, 2).unbind(2)
+        matrix = torch.stack((x, y, torch.cross(x, y, dim=1)), 2) @ matrix_from_quat(turn)
+        changed = state.clone()
+        changed[:, STATE["root_rot6d"]] = matrix[:, :, :2].reshape(-1, 6)
+        changed[:, STATE["joint_pos"]] += position[:, self._order]
+        changed[:, STATE["joint_vel"]] += velocity[:, self._order]
+        return torch.where(noisy, changed, state)
+
+    def on_picture(self, name: str, picture: torch.Tensor, mask: np.ndarray, ticks: np.ndarray) -> torch.Tensor:
+        """The picture of one camera, uint8, shape [worlds, H, W, 3], that a policy gets of the masked worlds."""
+        worlds = np.flatnonzero(mask & (self._pictures > 0.0)).tolist()
+        picture = picture.clone() if worlds else picture
+        for world in worlds:
+            rng = seeding.sensor_rng(self._seeds[world], int(ticks[world]), name)
+            noise = rng.standard_normal(picture.shape[1:], np.float32) * np.float32(self._pictures[world])
+            seen = picture[world].float() + torch.from_numpy(noise).to(picture.device)
+            picture[world] = seen.round().clamp(0.0, 255.0).to(torch.uint8)
+        return picture

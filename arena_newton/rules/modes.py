@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +18,18 @@ from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
 
 __all__ = ["BUILT_IN", "DYNAMICS", "HELD_OUT", "QUANTITIES", "Mode", "Quantity"]
-__all__ += ["get", "names", "register", "unregister"]
+__all__ += ["get", "is_composed", "names", "register", "unregister"]
 
 DYNAMICS = "dynamics"
 """Record name of what a mode draws about an episode's dynamics, next to the names of the objects."""
 MOST_LATENCY = 10
 """Longest latency [ticks]."""
+MOST_LETTERS = 100
+"""Longest name of a mode with quantities added to it, which names files too."""
+PLUS, TO = "+", ".."
+"""Signs before a quantity that a mode's name adds, and between the ends of its range."""
+_NUMBER = r"(-?[0-9]{1,9}(?:\.[0-9]{1,9})?)"
+_ADDED = re.compile(rf"([a-z_]+)={_NUMBER}(?:{re.escape(TO)}{_NUMBER})?")
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,11 @@ QUANTITIES: Mapping[str, Quantity] = {
     "push": Quantity(0.0, "m/s", "sudden change of the base's horizontal velocity"),
     "push_heading": Quantity(0.0, "rad", "direction of that push in the world, from x"),
     "push_time": Quantity(0.0, "", "its time after step 0, as a fraction of the rule set's step budget"),
+    "joint_pos_noise": Quantity(0.0, "rad", "deviation of each measured joint position that policy and tracker get"),
+    "joint_vel_noise": Quantity(0.0, "rad/s", "deviation of each measured joint velocity that they get"),
+    "orientation_noise": Quantity(0.0, "rad", "deviation of the measured root orientation, about each of its axes"),
+    "gyro_noise": Quantity(0.0, "rad/s", "deviation of the root's measured angular velocity, which trackers get"),
+    "picture_noise": Quantity(0.0, "of 255", "deviation of each colour of the pictures that policies get"),
 }
 """Everything that a mode may draw about an episode's dynamics."""
 
@@ -185,16 +197,50 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> Mode:
-    """A mode by name.
+    """A mode by name; `execution+push=0.5+gyro_noise=0.1..0.3` draws these too, instead of what the mode says of them.
+
+    A push that is named without its time or heading gets those of `dynamics`, where the mode has none.
 
     Raises:
-        InputError: Unknown name, or a package that offers something else.
+        InputError: Unknown name, a package that offers something else, or a quantity that is none.
     """
+    known, plus, added = name.partition(PLUS)
+    if plus:
+        return _with(get(known), name, added.split(PLUS))
     if name in BUILT_IN:
         return BUILT_IN[name]
     if name not in names():
         raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
     return _MODES.make(name)
+
+
+def is_composed(name: object) -> bool:
+    """True for the name of a mode with quantities added to it, as `get` takes it."""
+    try:
+        return isinstance(name, str) and PLUS in name and bool(get(name))
+    except InputError:
+        return False
+
+
+def _with(mode: Mode, name: str, added: list[str]) -> Mode:
+    """A mode that also draws the quantities of texts such as `push=0.5..1`."""
+    if len(name) > MOST_LETTERS:
+        raise InputError(f"--mode {name[:MOST_LETTERS]}…: longer than {MOST_LETTERS} letters")
+    if mode.scene == "layer":
+        raise InputError(f"--mode {name}: {mode.name} has a layer of its own, to which no quantity can be added")
+    given: dict[str, Range] = {}
+    for text in added:
+        found = _ADDED.fullmatch(text)
+        if not found:
+            raise InputError(f"--mode {name}: {text!r}: expected a quantity and its value or range, as push=0.5{TO}1")
+        quantity, low, high = found.groups()
+        given[quantity] = float(low), float(low if high is None else high)
+    if len(given) < len(added):
+        raise InputError(f"--mode {name}: a quantity is given twice")
+    if "push" in given:
+        drawn = BUILT_IN[DYNAMICS].dynamics
+        given = {key: drawn[key] for key in ("push_heading", "push_time")} | dict(mode.dynamics) | given
+    return dataclasses.replace(mode, name=name, dynamics={**mode.dynamics, **given})
 
 
 def register(mode: Mode) -> None:

@@ -10,7 +10,7 @@ import zlib
 import numpy as np
 
 __all__ = ["DEMONSTRATION", "EVALUATION", "TELEOPERATION", "episode_seed", "light_rng", "object_rng", "object_seed"]
-__all__ += ["dynamics_rng", "planned_seed", "policy_seed", "recording_seed", "seed_range"]
+__all__ += ["dynamics_rng", "planned_seed", "policy_seed", "recording_seed", "seed_range", "sensor_rng"]
 
 EVALUATION = "evaluation"
 """Range of the seeds that judge a policy, which are positive int32 as the original's: 0 to 2^31 - 1."""
@@ -103,3 +103,9 @@ def dynamics_rng(episode_seed: int, quantity: str) -> random.Random:
     """Generator of one quantity of an episode's dynamics, by SHA-256 of its name and the episode seed."""
     digest = hashlib.sha256(f"dynamics|{quantity}|{int(episode_seed)}".encode()).digest()
     return random.Random(int.from_bytes(digest[:8], "big"))
+
+
+def sensor_rng(episode_seed: int, tick: int, sensor: str = "state") -> np.random.Generator:
+    """Generator of one sensor's noise at one tick of an episode, by SHA-256 of their names and the episode seed."""
+    digest = hashlib.sha256(f"sensor|{sensor}|{int(episode_seed)}|{tick}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "big"))

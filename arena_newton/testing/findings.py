@@ -64,8 +64,12 @@ class ConformanceError(ArenaError, AssertionError):
 
 
 def perform(checks: Sequence[Promise]) -> list[CheckResult]:
-    """Try every promise; an error of the plug-in is a finding, and the next check goes on."""
-    found = []
+    """Try every promise; an error of the plug-in is a finding, and the next check goes on.
+
+    An error that several checks meet, such as that of a wrong signature, is told once.
+    """
+    found: list[CheckResult] = []
+    told: dict[str, str] = {}
     for check in checks:
         try:
             remark = check.attempt()
@@ -73,8 +77,10 @@ def perform(checks: Sequence[Promise]) -> list[CheckResult]:
         except Violation as violation:
             found.append(CheckResult(check.name, False, plain_text(violation, _LONGEST)))
         except Exception as error:
-            message = f"raised {type(error).__name__}: {error}"
-            found.append(CheckResult(check.name, False, plain_text(message, _LONGEST)))
+            message = plain_text(f"raised {type(error).__name__}: {error}", _LONGEST)
+            first = told.setdefault(message, check.name)
+            message = message if first == check.name else f"the same error as {first}"
+            found.append(CheckResult(check.name, False, message))
     return found
 
 

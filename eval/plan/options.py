@@ -79,7 +79,8 @@ class Conditions:
 
     mode: Several[str] = ()
     """Evaluation modes, one or several: base (when none is named) execution semantic visual, dynamics, and the held-out
-    looks semantic-2 semantic-3. Modes with one scene (base execution visual dynamics) play in one batch of worlds."""
+    looks semantic-2 semantic-3. Modes with one scene (base execution visual dynamics) play in one batch of worlds.
+    base+push=0.5+gyro_noise=0..0.2 adds a push, noise of sensors, latency, friction ... (docs/reference/rules.md)."""
     rules: str = "paper"
     """Rule set: paper or released."""
     drive: str = "auto"

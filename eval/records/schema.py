@@ -29,7 +29,7 @@ MAX_EPISODES = 200_000
 """Episodes of one plan; the benchmark's largest has 1,680."""
 
 Task = Annotated[str, Known(tasks.names)]
-Mode = Annotated[str, Known(modes.names)]
+Mode = Annotated[str, Known(modes.names, modes.is_composed)]
 Count = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_COUNT)]
 Positive = Annotated[int, Fit("a number of at least 1", lambda value: 1 <= value <= MAX_COUNT)]
 Seed = Annotated[int, Fit("a number of at least 0", lambda value: 0 <= value <= MAX_SEED)]

@@ -16,9 +16,13 @@ from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.identity import mode_facts
 from arena_newton.physics.dynamics import Delay
+from arena_newton.pictures.settings import CameraConfig
+from arena_newton.robot.canonical import STAND_ACTION, STATE
+from arena_newton.robot.g1 import CANONICAL_TO_MUJOCO
 from arena_newton.rules import modes
 from arena_newton.rules.modes import DYNAMICS, QUANTITIES, Mode
 from arena_newton.usd_scenes.preview import preview
+from tests.scenes import scene
 
 PAPER = rule_sets.get("paper")
 USUAL = {name: quantity.usual for name, quantity in QUANTITIES.items()}
@@ -267,3 +271,94 @@ def test_pushes_and_latencies_come_when_they_were_drawn():
     assert torch.equal(torch.stack(targets)[2:, 2], torch.stack(targets)[:-2, 0])
     assert torch.equal(targets[0][2], targets[0][0]) and torch.equal(targets[1][2], targets[0][0])
     assert torch.equal(states[1][2], states[0][2]) and not torch.equal(states[1][0], states[0][0])
+
+
+def played(mode, worlds, seeds, ticks=12, **more):
+    """States that a policy is shown, and what the physics holds after them: shapes [ticks, worlds, n]."""
+    env = ArenaEnv(
+        "boxing", tracker=trackers.get("twist2"), worlds=worlds, engine="mujoco", threads=1, mode="base", **more
+    )
+    env.reset(seeds, modes=mode)
+    shown, held = [], []
+    while int(env.tick[0]) < ticks:
+        if int(env.tick[0]) >= 0:
+            observed = env.observe()
+            assert torch.equal(env.observe().state, observed.state)
+            shown.append(observed.state.clone())
+            held.append(torch.from_numpy(env.physics.qpos.numpy().copy()))
+        env.step(torch.tensor(STAND_ACTION).repeat(worlds, 1))
+    env.close()
+    return torch.stack(shown), torch.stack(held)
+
+
+def test_a_quantity_is_added_to_a_mode_by_its_name():
+    """`base+push=0.5` draws it too: it is part of a run's identity, a range is drawn, a push gets time and heading."""
+    mode = modes.get("execution+push=0.5+gyro_noise=0.1..0.3")
+    drawn = [mode.draw(seed) for seed in range(40)]
+    assert {one["push"] for one in drawn} == {0.5} and all(0.1 <= one["gyro_noise"] <= 0.3 for one in drawn)
+    assert all(0.02 <= one["push_time"] <= 0.25 and one["push_heading"] for one in drawn)
+    assert modes.get("base+push=1+push_time=0.1").draw(3)["push_time"] == 0.1
+    spec = tasks.get("football")
+    assert spec.draw(3, mode.name, PAPER).placed == spec.draw(3, "execution", PAPER).placed
+    assert modes.is_composed(mode.name) and not any(map(modes.is_composed, ("base", "base+x=1", 1)))
+    facts = [mode_facts(f"base+push={speed}", PAPER, ("football",)) for speed in ("0.5", "0.6")]
+    assert facts[0] != facts[1] and mode_facts("base", PAPER, ("football",)) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("base+push", "--mode base\\+push: 'push': expected a quantity and its value or range, as push=0.5..1"),
+        ("base+push=fast", "'push=fast': expected a quantity"),
+        ("base+", "'': expected a quantity"),
+        ("base+push=1\n", "expected a quantity"),
+        ("base+push=nan", "expected a quantity"),
+        ("base" + "+gains=1" * 20, "longer than 100 letters"),
+        ("base+push=1+push=2", "a quantity is given twice"),
+        ("base+weight=1", "weight is none of friction"),
+        ("base+gyro_noise=-1", "gyro_noise: -1 to -1 is not a range of it"),
+        ("night+push=1", "--mode night: unknown"),
+        ("semantic-2+push=1", "semantic-2 has a layer of its own, to which no quantity can be added"),
+    ],
+)
+def test_quantities_that_are_none_are_refused(name, message):
+    """What is added to a mode is a known quantity with a value or a range of it, once."""
+    with pytest.raises(InputError, match=message):
+        modes.get(name)
+
+
+def test_noise_is_of_the_sensors_and_of_its_worlds():
+    """Noise has its deviation and its episode's seed; policy and tracker get it; a world without it keeps every bit."""
+    noisy = "base+joint_pos_noise=0.02+joint_vel_noise=0.3+orientation_noise=0.01+gyro_noise=0.1"
+    shown, held = played(["base", noisy, noisy], 3, [5, 5, 6])
+    alone, moved = played([noisy], 1, [5])
+    exact, still = played(["base"], 1, [5])
+    assert torch.equal(shown[:, 1], alone[:, 0]) and torch.equal(held[:, 1], moved[:, 0])
+    assert torch.equal(shown[:, 0], exact[:, 0]) and torch.equal(held[:, 0], still[:, 0])
+    assert not torch.equal(held[-1, 1], held[-1, 0])  # the tracker reacts
+    joints = held[:, 1][:, scene("boxing").robot.joint_qpos[list(CANONICAL_TO_MUJOCO)]]
+    error = shown[:, 1, STATE["joint_pos"]] - joints
+    assert 0.015 < error.std() < 0.025 and error.mean().abs() < 0.005
+    assert not torch.equal(shown[:, 1], shown[:, 2])
+    columns = shown[:, 1, STATE["root_rot6d"]].reshape(-1, 3, 2)
+    assert torch.allclose(columns.transpose(1, 2) @ columns, torch.eye(2), atol=1e-5)
+
+
+def test_noise_of_pictures_is_seen_and_needs_a_camera():
+    """Colours of a picture have the noise of their episode and tick; without a camera it is refused by name."""
+    camera = CameraConfig(32, 24, fit="native")
+    pictures = {}
+    for name in ("base", "base+picture_noise=8"):
+        env = ArenaEnv(
+            "boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", threads=1, mode=name, camera=camera
+        )
+        env.reset([5])
+        first, again = (env.observe(np.ones(1, bool), image=True).image.float().clone() for _ in "ab")
+        assert torch.equal(first, again)
+        pictures[name] = first
+        env.close()
+    assert 4.0 < (pictures["base+picture_noise=8"] - pictures["base"]).std() < 9.0
+    blind = ArenaEnv("boxing", tracker=trackers.get("pd"), worlds=1, engine="mujoco", threads=1)
+    with pytest.raises(InputError, match="picture_noise, but the policy wants no picture"):
+        blind.reset([5], modes=["base+picture_noise=8"])
+    blind.close()

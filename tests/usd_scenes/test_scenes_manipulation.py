@@ -12,7 +12,7 @@ from scene_builders import author, patterns, rooms, textures, warehouse
 from scene_builders.__main__ import build_all
 from tests.scenes import scene
 
-SCENES = tuple(name for name in tasks.names() if tasks.get(name).suite == "HOI")
+SCENES = tuple(name for name in tasks.OWN if tasks.get(name).suite == "HOI")
 
 
 def start(task: str, *, dt: float = 0.005, variant: str = "base"):
@@ -210,9 +210,9 @@ def test_stocked_decks_leave_the_second_one_empty():
 
 def test_layers_are_what_their_authors_write(tmp_path):
     """Building again gives the stored scenes, variants and textures, byte for byte."""
-    build_all(tmp_path, ["textures", "patterns", "g1", *tasks.names()])
+    build_all(tmp_path, ["textures", "patterns", "g1", *tasks.OWN])
     files = sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file())
-    assert len(files) >= len(textures.TEXTURES) + 2 * len(tasks.names())
+    assert len(files) >= len(textures.TEXTURES) + 2 * len(tasks.OWN)
     for file in files:
         assert (tmp_path / file).read_bytes() == (tasks.base.SCENES / file).read_bytes(), file
 
@@ -262,6 +262,6 @@ def test_textures_are_small(tmp_path):
 
 def test_scenes_name_no_path_of_a_machine():
     """The stored layers contain relative asset paths only."""
-    for task in tasks.names():
+    for task in tasks.OWN:
         for layer in (tasks.base.SCENES / task).rglob("*.usda"):
             assert "@/" not in layer.read_text(), layer

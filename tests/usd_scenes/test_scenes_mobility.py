@@ -15,7 +15,7 @@ from arena_newton.rules.modes import HELD_OUT
 from arena_newton.tasks.semantic_mode import semantic_note, task_title
 from tests.scenes import scene
 
-TASKS = tuple(name for name in tasks.names() if tasks.get(name).suite == "HSI")
+TASKS = tuple(name for name in tasks.OWN if tasks.get(name).suite == "HSI")
 OBSTACLES = tuple(f"/World/{kind}_{letter}" for kind in ("Beam", "Block") for letter in "abc")
 LOOKS = ("semantic", *HELD_OUT)
 
@@ -29,7 +29,7 @@ def fresh(built, dt=0.005):
     return m, data
 
 
-@pytest.mark.parametrize("task", tasks.names())
+@pytest.mark.parametrize("task", tasks.OWN)
 def test_scene_is_light_enough(task):
     """A scene with its robot holds fewer than 150 shapes and fewer than 60 solids of its own."""
     built = scene(task)
@@ -260,7 +260,7 @@ def head_picture(scene):
     return camera.render(scene.model.state())[0].cpu().numpy().astype(int)
 
 
-@pytest.mark.parametrize("task", tasks.names())
+@pytest.mark.parametrize("task", tasks.OWN)
 def test_semantic_modes_change_looks_and_clutter_alone(task):
     """Semantic modes compile to base mode's model to the last bit, but for their task's clutter; all look different.
 

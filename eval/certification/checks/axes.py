@@ -49,6 +49,8 @@ SCALED = 1e-12
 """Relative error of a scaled field: rounding."""
 SEMANTIC_LOSS = (3, 60)
 """Successes, of so many episodes, by which semantic mode may differ."""
+_UNSEEN = ("push_heading", "push_time", "picture_noise")
+"""Quantities that alone move no robot that stands."""
 
 
 def visual(context: Context) -> CheckFinding:
@@ -305,7 +307,7 @@ def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS)
     """
     usual = {key: quantity.usual for key, quantity in modes.QUANTITIES.items()}
     ends = {key: max(bounds, key=lambda end: abs(end - usual[key])) for key, bounds in modes.get(mode).dynamics.items()}
-    alone = [key for key, end in ends.items() if end != usual[key] and key not in ("push_heading", "push_time")]
+    alone = [key for key, end in ends.items() if end != usual[key] and key not in _UNSEEN]
     if not alone:
         return []
     env = world_of(context, task, tracker, worlds=2 + len(alone))

@@ -137,7 +137,7 @@ def test_a_process_of_a_quick_certification_compares_no_rates_on_a_cpu(monkeypat
 
 def test_a_quick_check_of_any_task_has_an_outcome():
     """Also of a task in which none of the kinds is scripted then: the real failures are read all the same."""
-    for task in tasks.names():
+    for task in tasks.OWN:
         given = {"tasks": (task,), "sample": ("twist2",), "evaluate": lambda cell: [], "episodes": 2}
         found = failures(SimpleNamespace(options=SimpleNamespace(quick=True), **given))
         assert found.verdict == "pass" and "0 of 0 scripted" in found.summary
