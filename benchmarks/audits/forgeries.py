@@ -314,7 +314,7 @@ FORGERIES: dict[str, Forgery] = TABLES | {
     "predicates removed": edited("success", predicates={}),
     "a predicate renamed": edited("timeout", predicates={"goal": None}),
     "a predicate after the end": edited("timeout", predicates=lambda line: line["predicates"] | {"approach": 9999}),
-    "progress": edited("timeout", progress=0.75),
+    "progress": edited("timeout", progress=0.99),
     "a predicate and progress": with_predicate,
     "event of the fall removed": edited("fall", events=[]),
     "fall moved past the end": edited("fall", events=[{"kind": "fall", "tick": 99999, "detail": "tilt"}]),
