@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from arena_newton.errors import InputError
+from arena_newton.physics.mujoco_engine import lone_joints
 from arena_newton.physics.scene import Scene
 
 __all__ = ["ImplicitWorld", "Inputs", "check", "scaled"]
@@ -168,10 +169,10 @@ class ImplicitWorld:
         ]
         self._alone = [
             (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), np.flatnonzero(model.body_treeid == tree).tolist())
-            for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-            if model.tree_dofnum[tree := model.body_treeid[model.jnt_bodyid[j]]] == 6
+            for j in lone_joints(model)
+            for tree in [model.body_treeid[model.jnt_bodyid[j]]]
         ]
-        """Address of position, of velocity, and rigid bodies of each free joint that is its tree's only one."""
+        """Address of position, of velocity, and rigid bodies of each of `lone_joints`."""
         self._turns = np.array([[dof + 3, dof + 4, dof + 5] for _, dof, _ in self._alone], int).reshape(-1, 3)
         self._own = np.array([range(dof, dof + 6) for _, dof, _ in self._alone], int).reshape(-1, 6)
         self._lumped: tuple[bytes, np.ndarray, np.ndarray, np.ndarray] | None = None

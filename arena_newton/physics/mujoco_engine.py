@@ -15,10 +15,17 @@ from arena_newton.physics.batch import Physics
 from arena_newton.physics.scene import Scene
 from arena_newton.robot.g1 import PhysicsRate
 
-__all__ = ["MujocoPhysics", "MujocoSnapshot"]
+__all__ = ["MujocoPhysics", "MujocoSnapshot", "lone_joints"]
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BUFFERS_FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+
+
+def lone_joints(model: mujoco.MjModel) -> np.ndarray:
+    """Free joints of bodies that move by themselves: those that have no other joint in their tree."""
+    joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    found: np.ndarray = joints[model.tree_dofnum[model.body_treeid[model.jnt_bodyid[joints]]] == 6]
+    return found
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from arena_newton.data.recording.episode import EpisodeFile
 from arena_newton.errors import InputError
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.interfaces import EpisodeResult, Observation, Recorder, World
-from arena_newton.physics.mujoco_engine import MujocoPhysics
+from arena_newton.physics.mujoco_engine import MujocoPhysics, lone_joints
 
-__all__ = ["EPISODE", "SECOND", "START", "STILL", "LoneBodies", "StatesAgain", "TickDifferences", "surface_radii"]
+__all__ = ["EPISODE", "SECOND", "START", "STILL", "LoneBodies", "StatesAgain", "TickDifferences"]
 
 EPISODE = "episode"
 """Name of the recording of an episode among its media."""
@@ -71,21 +71,6 @@ def _largest(differences: list[np.ndarray], ticks: int) -> np.ndarray:
     return largest
 
 
-def surface_radii(model: mujoco.MjModel) -> np.ndarray:
-    """Factors of degrees of freedom, shape [nv]: of a lone body's spin its farthest surface [m], else 1.
-
-    A kick pinches the ball between foot and floor; engines agree on its speed then, and not on its spin.
-    """
-    factors = np.ones(model.nv)
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        first, body = model.jnt_dofadr[joint], model.jnt_bodyid[joint]
-        if np.count_nonzero(model.dof_treeid == model.dof_treeid[first]) == 6:
-            shapes = model.body_rootid[model.geom_bodyid] == body
-            reach = np.linalg.norm(model.geom_pos[shapes], axis=1) + model.geom_rbound[shapes]
-            factors[first + 3 : first + 6] = reach.max(initial=0.0) or 1.0
-    return factors
-
-
 class LoneBodies:
     """Sums of differences of bodies that move freely by themselves, since something that moves was last near each.
 
@@ -95,14 +80,18 @@ class LoneBodies:
     def __init__(self, model: mujoco.MjModel):
         """Know where they are in a scene's state."""
         trees = model.body_treeid
-        reach = np.zeros(model.nbody)
-        np.maximum.at(reach, model.geom_bodyid, np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound)
-        self._reach = reach
-        joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        joints = joints[model.tree_dofnum[trees[model.jnt_bodyid[joints]]] == 6]
+        self._reach = np.zeros(model.nbody)
+        np.maximum.at(self._reach, model.geom_bodyid, np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound)
+        joints = lone_joints(model)
         self._bodies = model.jnt_bodyid[joints]
         self._dofs = model.jnt_dofadr[joints]
         self._others = [(trees == trees[body], (trees >= 0) & (trees != trees[body])) for body in self._bodies]
+        self.radii = np.ones(model.nv)
+        """Factors of degrees of freedom: of a lone body's spin its farthest surface [m], else 1.
+
+        A kick pinches the ball between foot and floor; engines agree on its speed then, and not on its spin."""
+        for dof, (own, _) in zip(self._dofs, self._others, strict=True):
+            self.radii[dof + 3 : dof + 6] = self._reach[own].max() or 1.0
         self._sums, self._fastest = np.zeros((3, len(joints), 2)), np.zeros(len(joints))
 
     def worst(
@@ -150,9 +139,8 @@ class _Recorded:
     """Before each tick and at the end, shape [ticks + 1, nq]."""
     velocities: np.ndarray
     """Before each tick, shape [ticks, nv]."""
-    radii: np.ndarray
-    """Radii of spin, shape [nv] (`surface_radii`)."""
     lone: LoneBodies
+    """Sums of this episode."""
     bodies: np.ndarray
     """Positions of the bodies in the recorded state before, shape [nbody, 3]."""
 
@@ -178,8 +166,8 @@ class StatesAgain(Recorder):
         velocities = file.array("arena_qvel", len(positions), model.nv)
         if not len(velocities):
             raise InputError(f"{file.path}: arena_qvel holds no tick")
-        states, radii, bodies = np.vstack([positions, last]), surface_radii(model), np.zeros((model.nbody, 3))
-        self._states[world] = _Recorded(episode.index, states, velocities, radii, LoneBodies(model), bodies)
+        states, bodies = np.vstack([positions, last]), np.zeros((model.nbody, 3))
+        self._states[world] = _Recorded(episode.index, states, velocities, LoneBodies(model), bodies)
         self.differences[episode.index] = TickDifferences()
 
     def before_physics(self, env: World, observation: Observation | None, action: torch.Tensor) -> None:
@@ -205,7 +193,7 @@ class StatesAgain(Recorder):
         if found.states:
             found.positions.append(bodies - given)
             if tick == last:
-                gained, quats = (mine.velocities[tick] - moving) * mine.radii, env.physics.xquat.numpy()[world]
+                gained, quats = (mine.velocities[tick] - moving) * mine.lone.radii, env.physics.xquat.numpy()[world]
                 found.velocities.append(gained)
                 near = mine.bodies, bodies, bodies - given
                 worst = mine.lone.worst(*near, gained, mine.velocities[tick], quats.astype(np.float64))

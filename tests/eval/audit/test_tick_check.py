@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from arena_newton.eval.audit.tick_check import LoneBodies, surface_radii
+from arena_newton.eval.audit.tick_check import LoneBodies
 
 SCENE = """<mujoco><worldbody>
   <body pos="0 0 1"><freejoint/><geom type="sphere" size="0.11" pos="0.2 0 0"/></body>
@@ -15,7 +15,7 @@ SCENE = """<mujoco><worldbody>
 
 def test_spin_of_a_lone_body_counts_at_its_surface():
     """Of a ball by the distance of its farthest point; bodies with joints and all speeds keep their units."""
-    factors = surface_radii(mujoco.MjModel.from_xml_string(SCENE))
+    factors = LoneBodies(mujoco.MjModel.from_xml_string(SCENE)).radii
     np.testing.assert_allclose(factors, [1, 1, 1, *[0.31] * 3, *[1] * 7])
 
 
