@@ -100,6 +100,7 @@ class SensorNoise:
         self._seeds: list[int] = [0] * worlds
         self._drawn_at = np.full(worlds, np.iinfo(np.int64).min)
         self._drawn = np.zeros(self._deviations.shape, np.float32)
+        self._shown: tuple[torch.Tensor, ...] = ()
         self._device = device
         self._order = torch.tensor(CANONICAL_TO_MUJOCO, device=device)
 
@@ -112,8 +113,11 @@ class SensorNoise:
 
     def _draws(self, ticks: np.ndarray) -> tuple[torch.Tensor, ...]:
         """Worlds with noise, shape [worlds, 1], and that of their tick: positions, velocities, gyro, a quaternion."""
+        fresh = self._drawn_at != ticks
+        if not fresh.any():  # the policy and the tracker see the same
+            return self._shown
         noisy = self._deviations.any(axis=1)
-        for world in np.flatnonzero(noisy & (self._drawn_at != ticks)).tolist():
+        for world in np.flatnonzero(noisy & fresh).tolist():
             rng = seeding.sensor_rng(self._seeds[world], int(ticks[world]))
             self._drawn[world] = rng.standard_normal(self._drawn.shape[1]) * self._deviations[world]
         self._drawn_at[:] = ticks
@@ -122,7 +126,8 @@ class SensorNoise:
         half = 0.5 * turn
         angle = half.norm(dim=1, keepdim=True)
         quat = torch.cat((torch.cos(angle), half * torch.sinc(angle / np.pi)), 1)
-        return torch.from_numpy(noisy)[:, None].to(self._device), position, velocity, gyro, quat
+        self._shown = torch.from_numpy(noisy)[:, None].to(self._device), position, velocity, gyro, quat
+        return self._shown
 
     def on_robot(self, state: RobotState, ticks: np.ndarray) -> RobotState:
         """The state that a tracker gets at these ticks of the worlds; position and base velocity stay exact."""
