@@ -36,7 +36,7 @@ def clips(count: int, ticks: int) -> torch.Tensor:
 
 
 class Learner(torch.nn.Module):
-    """What is trained, a linear layer; it notes what it saw and did."""
+    """A linear layer that is trained; it notes what it saw and did."""
 
     shape: tuple[int, int]
     spread: float
@@ -54,7 +54,7 @@ class Learner(torch.nn.Module):
         raise NotImplementedError
 
     def act(self, seen: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-        """What the weights do, shape [parts, worlds, outputs]."""
+        """Outputs of the weights, with noise, shape [parts, worlds, outputs]."""
         mean = (weights @ seen[..., None])[..., 0]
         self.seen.append(seen)
         self.done.append(mean + self.noise * torch.randn_like(mean))
@@ -220,7 +220,7 @@ def main() -> None:
     term = {"energy": 1, "slip": 2}.get(args.what, 0)
 
     def cost(found: torch.Tensor) -> torch.Tensor:
-        """What is to fall, and the error, each as a part of what it was at first."""
+        """Term that is to fall, and the error, each as a part of what it was at first."""
         return found[0] if args.what == "policy" else found[term] / first[term] + (term > 0) * found[0] / first[0]
 
     for name, method in {"gradient": by_gradient, "PPO": by_ppo, "ES": by_es}.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.interfaces import RobotState, TrackerCommand
 from arena_newton.robot.canonical import MIMIC
 from arena_newton.robot.g1 import MUJOCO_TO_CANONICAL
+from arena_newton.robot.rotations import quat_conjugate
 from arena_newton.trackers.evaluation.stand_check import stand
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["mistake_figures"]
 
-CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
 CANONICAL = list(MUJOCO_TO_CANONICAL)
 LEGS = [*range(6, 12), *range(6), *range(12, 29)]
 """Joints with left and right leg swapped."""
@@ -44,7 +43,7 @@ def _joints(command: TrackerCommand, change: Callable[[torch.Tensor], torch.Tens
 
 
 SHOWN: dict[str, Callable[[TrackerCommand, RobotState], Seen]] = {
-    "orientation conjugated": lambda c, s: (c, replace(s, quat=s.quat * CONJUGATE)),
+    "orientation conjugated": lambda c, s: (c, replace(s, quat=quat_conjugate(s.quat))),
     "orientation as xyzw": lambda c, s: (c, replace(s, quat=s.quat[:, [1, 2, 3, 0]])),
     "angular velocity of the other sign": lambda c, s: (c, replace(s, ang_vel_body=-s.ang_vel_body)),
     "angular velocity: x, y of the other sign": lambda c, s: (
@@ -56,7 +55,7 @@ SHOWN: dict[str, Callable[[TrackerCommand, RobotState], Seen]] = {
     "joints with arms swapped": lambda c, s: (c, replace(s, joint_pos=s.joint_pos[:, ARMS])),
     "joint velocities of the other sign": lambda c, s: (c, replace(s, joint_vel=-s.joint_vel)),
     "joint velocities in canonical order": lambda c, s: (c, replace(s, joint_vel=s.joint_vel[:, CANONICAL])),
-    "command: orientation conjugated": lambda c, s: (replace(c, quat=c.quat * CONJUGATE), s),
+    "command: orientation conjugated": lambda c, s: (replace(c, quat=quat_conjugate(c.quat)), s),
     "command: joints in canonical order": lambda c, s: (_joints(c, lambda v: v[:, CANONICAL]), s),
     "command: legs swapped": lambda c, s: (_joints(c, lambda v: v[:, LEGS]), s),
     "command: arms swapped": lambda c, s: (_joints(c, lambda v: v[:, ARMS]), s),
@@ -95,7 +94,7 @@ def _measured(options: MistakesOptions, mistake: str | None) -> tuple[bool, str]
         front.write = lambda command, state: write(*change(command, state))
     elif mistake in SCALES:
         form = front.action_form
-        front.action_form = dataclasses.replace(form, scale=tuple(SCALES[mistake] * one for one in form.scale))
+        front.action_form = replace(form, scale=tuple(SCALES[mistake] * one for one in form.scale))
     elif mistake == POSE:
         front.default_pose = tuple(-angle for angle in front.default_pose)
     results = stand(tracker, engine="mujoco", device="cpu")

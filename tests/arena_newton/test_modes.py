@@ -322,7 +322,7 @@ def test_a_quantity_is_added_to_a_mode_by_its_name():
     ],
 )
 def test_quantities_that_are_none_are_refused(name, message):
-    """What is added to a mode is a known quantity with a value or a range of it, once."""
+    """Quantities that are added to a mode are known ones with a value or a range, each once."""
     with pytest.raises(InputError, match=message):
         modes.get(name)
 
