@@ -1,6 +1,7 @@
 """Fixtures of all tests: reference material, scenes that are built once per session, and a small heap to collect."""
 
 import gc
+import importlib.metadata
 import os
 import shutil
 import signal
@@ -134,16 +135,29 @@ def install(package: Path, folder: Path) -> Path:
     """The folder of site packages into which the wheel of a package is unpacked, as an installer does it."""
     from hatchling.builders.wheel import WheelBuilder
 
-    wheel = next(WheelBuilder(str(package)).build(directory=str(folder), versions=["standard"]))
+    wheel, site = next(WheelBuilder(str(package)).build(directory=str(folder), versions=["standard"])), "site-packages"
     with zipfile.ZipFile(wheel) as file:
-        file.extractall(folder / "site-packages")
-    return folder / "site-packages"
+        file.extractall(folder / site)
+    (folder / "bin").mkdir()
+    for one in importlib.metadata.distributions(path=[str(folder / site)]):
+        for point in one.entry_points.select(group="console_scripts"):
+            called = f"import sys\nsys.path.insert(0, {str(folder / site)!r})\nimport {point.module}\n"
+            (folder / "bin" / point.name).write_text(f"#!{sys.executable}\n{called}{point.module}.{point.attr}()\n")
+            (folder / "bin" / point.name).chmod(0o755)
+    return folder / site
 
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
-    """Leaves a package, named by its folder, as an installer does: importable, with its entry points, for one test."""
-    yield lambda package: monkeypatch.syspath_prepend(install(package, tmp_path / "installed" / package.name))
+    """Leaves a package, named by its folder, as an installer does: importable, with entry points and commands."""
+
+    def leave(package: Path) -> Path:
+        site = install(package, tmp_path / "installed" / package.name)
+        monkeypatch.syspath_prepend(site)
+        monkeypatch.setenv("PATH", str(site.parent / "bin"), prepend=os.pathsep)
+        return site
+
+    yield leave
     for name, module in [*sys.modules.items()]:
         if (getattr(module, "__file__", None) or "").startswith(str(tmp_path / "installed")):
             del sys.modules[name]

@@ -31,7 +31,6 @@ SHORT: dict[str, list[str]] = {
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
-    "process_policy": RUN,
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "refine_reference": ["--max-steps", "4", "--rounds", "2"],
     "research": [*RUN, "--policy", "stand"],
@@ -52,7 +51,6 @@ SAYS = {
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
-    "process_policy": r"policy process:python process_policy.py, (.*\n)*1 episode, this run took",
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "refine_reference": r"played 0: a palm comes within -\d.\d+ m after 0.\d s\nplayed 1: a palm",
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
@@ -63,9 +61,7 @@ SAYS = {
     "usd_variant": r"green_sofa.png\nthe expert on the green sofa: timeout after 0.1 s\n",
 }
 """Example → what its output holds."""
-PROGRAMS = ("process_policy",)
-"""Examples that a run calls as its policy."""
-BARS = {"new_metric": 30, "new_mode": 40, "new_policy": 50, "new_task": 250, "new_tracker": 75}
+BARS = {"new_metric": 30, "new_mode": 40, "new_policy": 50, "new_program": 40, "new_task": 250, "new_tracker": 75}
 """Example that is a package → most lines of its code; each is installed and played below or next to what it extends."""
 
 
@@ -103,11 +99,8 @@ def test_example_runs(path, tmp_path, monkeypatch, capsys):
     flags = [str(tmp_path / "out") if flag == "OUT" else flag for flag in SHORT[path.stem]]
     monkeypatch.setattr(sys, "argv", [str(path), *flags])
     monkeypatch.chdir(tmp_path)
-    if path.stem in PROGRAMS:
-        main([*flags, "--policy", f"process:{sys.executable} {path}"])
-    else:
-        with contextlib.suppress(SystemExit):
-            runpy.run_path(str(path), run_name="__main__")
+    with contextlib.suppress(SystemExit):
+        runpy.run_path(str(path), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(SAYS[path.stem], printed), printed
     if "OUT" in SHORT[path.stem]:
@@ -161,3 +154,18 @@ def test_packages_of_a_mode_a_metric_and_a_policy_play(installed, tmp_path, caps
     assert lines.count('"highest_speed"') == 2
     assert main([*RUN, "--policy", "stand", "--recorder", "pace"]) == 2
     assert "error: --recorder pace: unknown recorder; known are speed" in capsys.readouterr().err
+
+
+def test_a_program_of_a_package_plays_by_its_command(installed, tmp_path, capsys):
+    """Installed, a program is a policy by its command; results know its code, and refuse to go on with another."""
+    code = installed(ROOT / "examples" / "new_program") / "squat_program.py"
+    run = [*RUN[:-1], str(tmp_path / "out"), "--policy", "process:squat"]
+    assert main(run) == 0
+    assert "| boxing | twist2  | process:squat | base |" in capsys.readouterr().out
+    facts = json.loads((tmp_path / "out" / "config.json").read_text())["config"]["policy_facts"]
+    assert facts["command"] == "squat" and re.fullmatch("squat [0-9a-f]{8}", facts["server"])
+    assert not facts["worlds_matter"]
+    assert main(run) == 0
+    code.write_text(code.read_text().replace("0.05", "0.06"))
+    assert main(run) == 2
+    assert f"another configuration: policy_facts.server was {facts['server']}, now squat " in capsys.readouterr().err
