@@ -293,3 +293,7 @@ def _print_findings() -> int:
     bad = sum(finding.status == "bad" for finding in findings)
     print(f"{bad} problems to mend" if bad else "ready: python -m arena_newton.eval")
     return 1 if bad else 0
+
+
+if __name__ == "__main__":  # by the front door, which hands --tracker and --policy to others
+    sys.exit(importlib.import_module("arena_newton.__main__").main(["doctor", *sys.argv[1:]]))

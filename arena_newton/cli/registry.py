@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, UnknownName
 
 __all__ = ["Registry"]
 
@@ -71,11 +71,12 @@ class Registry[T]:
         """Refuse a name that nobody offers, or that several do.
 
         Raises:
-            InputError: The message says what is known, or who offers it.
+            UnknownName: Nobody does; the message says what is known.
+            InputError: Several do; it says who.
         """
         if name not in self.names():
             known = ", ".join(self.names()) or "none: no package is installed that offers one"
-            raise InputError(f"--{self.noun} {name}: unknown {self.noun}; known are {known}")
+            raise UnknownName(f"--{self.noun} {name}: unknown {self.noun}; known are {known}")
         if name in self._registered:
             return
         offers = ["this package"] if name in self.built_in else []

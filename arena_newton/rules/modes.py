@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from arena_newton.cli.registry import Registry
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, UnknownName, check_once
 from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import CylinderRange, LightRange, ObjectRule, PoseRange, Range, RuleSet
 
@@ -210,7 +210,7 @@ def get(name: str) -> Mode:
     if name in BUILT_IN:
         return BUILT_IN[name]
     if name not in names():
-        raise InputError(f"--mode {name}: unknown, choose from {', '.join(names())}")
+        raise UnknownName(f"--mode {name}: unknown, choose from {', '.join(names())}")
     return _MODES.make(name)
 
 
@@ -228,6 +228,7 @@ def _with(mode: Mode, name: str, added: list[str]) -> Mode:
         raise InputError(f"--mode {name[:MOST_LETTERS]}…: longer than {MOST_LETTERS} letters")
     if mode.scene == "layer":
         raise InputError(f"--mode {name}: {mode.name} has a layer of its own, to which no quantity can be added")
+    check_once(f"--mode {name}:", (text.partition("=")[0] for text in added))
     given: dict[str, Range] = {}
     for text in added:
         found = _ADDED.fullmatch(text)
@@ -235,8 +236,6 @@ def _with(mode: Mode, name: str, added: list[str]) -> Mode:
             raise InputError(f"--mode {name}: {text!r}: expected a quantity and its value or range, as push=0.5{TO}1")
         quantity, low, high = found.groups()
         given[quantity] = float(low), float(low if high is None else high)
-    if len(given) < len(added):
-        raise InputError(f"--mode {name}: a quantity is given twice")
     if "push" in given:
         drawn = BUILT_IN[DYNAMICS].dynamics
         given = {key: drawn[key] for key in ("push_heading", "push_time")} | dict(mode.dynamics) | given

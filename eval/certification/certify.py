@@ -15,7 +15,7 @@ from arena_newton import trackers
 from arena_newton.cli.flags import check_least, user_path
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.doctor import versions
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.certification import certificate
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks import (
@@ -162,10 +162,9 @@ def _context(options: CertifyOptions, factories: Factories, bodies: Mapping[str,
     names, without = with_expert(options.task)
     if not names:
         raise InputError(f"--task {' '.join(without)}: no expert, and every check plays one")
-    for position, tracker in enumerate(options.tracker):
+    check_once("--tracker", options.tracker)
+    for tracker in options.tracker:
         trackers.check_spec(tracker)
-        if tracker in options.tracker[:position]:
-            raise InputError(f"--tracker {tracker}: given twice")
         if getattr(factories.tracker(tracker, None), "lookahead", 0):
             why = "reads the coming reference, which recorded actions do not hold: no replay of its episodes is equal"
             raise InputError(f"--tracker {tracker}: {why}, and certify compares them")

@@ -12,7 +12,7 @@ from pathlib import Path
 from arena_newton import tasks
 from arena_newton.cli.flags import shared
 from arena_newton.doctor import versions
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.stand_ins.bodies import BODIES, Body
 from arena_newton.eval.folders.results import load_run
@@ -240,9 +240,6 @@ def with_expert(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
         InputError: An unknown name, or one named twice.
     """
     chosen = tasks.PAPER if tuple(names) in ((), ("all",)) else tuple(names)
-    for name in chosen:
-        tasks.get(name)
-        if chosen.count(name) > 1:
-            raise InputError(f"--task {name}: given twice")
+    check_once("--task", chosen)
     has = tuple(name for name in chosen if tasks.get(name).expert is not None)
     return has, tuple(name for name in chosen if name not in has)

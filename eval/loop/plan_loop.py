@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arena_newton.cli.flags import flag_name, shell_command, words
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.folders.run_folder import results_folder
 from arena_newton.eval.loop import plan_report
 from arena_newton.eval.loop.loop_options import LoopOptions
@@ -51,9 +51,7 @@ def run(options: LoopOptions) -> int:
             raise InputError(f"{flag_name(one.name)}: belongs to a loop without --plan, whose file says it")
     plan = read_plan(str(options.plan))
     for name in ("rows", "seeds", "only"):
-        given = getattr(options, name)
-        if twice := [value for value in given if given.count(value) > 1]:
-            raise InputError(f"--{name} {twice[0]}: given twice")
+        check_once(f"--{name}", getattr(options, name))
     rows = [plan.row(name) for name in options.rows] or [plan.rows[0]]
     seeds = sorted(options.seeds) or list(plan.settings.seeds)
     if not all(1 <= seed <= 9999 for seed in seeds):

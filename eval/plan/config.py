@@ -18,7 +18,7 @@ from arena_newton import tasks as task_specs
 from arena_newton.cli.flags import check_least, shared
 from arena_newton.data.readers.looks import MOST_LIGHTS
 from arena_newton.data.recording.noise_levels import NoiseLevels
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.plan import episode_plan, rounds
 from arena_newton.eval.plan.flag_checks import DRIVES, check_flags
 from arena_newton.eval.plan.options import (
@@ -312,10 +312,9 @@ def resolve(options: RunOptions) -> RunConfig:
     for tracker in used:
         trackers.check_spec(tracker)
     policies.check_spec(options.policy)
-    for number, recorder in enumerate(options.recorder):
+    check_once("--recorder", options.recorder)
+    for recorder in options.recorder:
         recorders.check(recorder)
-        if recorder in options.recorder[:number]:
-            raise InputError(f"--recorder {recorder}: given twice")
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"
@@ -464,14 +463,11 @@ def recorded_cameras(options: RunOptions, flag: str = "--record-") -> dict[str, 
         raise InputError(
             f"{flag}looks: belongs to modes without looks of their own, not {min(shown)}: none must learn its looks"
         )
-    found = {}
     for name in options.record_cameras:
         if name not in CAMERAS:
             raise InputError(f"{flag}cameras {plain_text(name)}: unknown, choose from {' '.join(CAMERAS)}")
-        if name in found:
-            raise InputError(f"{flag}cameras {name}: given twice")
-        found[name] = recorded_camera(name, width, height)
-    return found
+    check_once(f"{flag}cameras", options.record_cameras)
+    return {name: recorded_camera(name, width, height) for name in options.record_cameras}
 
 
 def _checkpoint(options: RunOptions, used: Sequence[str]) -> tuple[Path | None, dict[str, str | None]]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arena_newton import rule_sets, tasks
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.records.schema import MAX_COUNT, MAX_EPISODES, MAX_SEED
 from arena_newton.files.own_files import file_label
 from arena_newton.files.stored_json import JsonObject
@@ -81,9 +81,7 @@ def expand(
     for flag, values in (("--task", names), ("--tracker", trackers), ("--mode", modes), (seeds_flag, seeds)):
         if not values:
             raise InputError(f"{flag}: nothing given, at least one value is needed")
-        twice = next((v for v in values if list(values).count(v) > 1), None)
-        if twice is not None:
-            raise InputError(f"{flag} {twice}: given twice")
+        check_once(flag, values)
     if len({file_label(name) for name in trackers}) < len(trackers):
         raise InputError(
             f"--tracker {' '.join(trackers)}: two have one name as a folder of actions; play each by itself"

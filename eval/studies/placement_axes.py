@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.rules import modes
 from arena_newton.rules.rule_types import CylinderRange, ObjectRule, PoseRange, TaskRules
 from arena_newton.tasks.base import Sample, object_range
@@ -108,8 +108,7 @@ def chosen(axes: Sequence[Axis], names: Sequence[str], task: str) -> tuple[Axis,
     for name in names:
         if name not in known:
             raise InputError(f"--axes {name}: task {task} draws {', '.join(known)}")
-    if len(set(names)) < len(names):
-        raise InputError(f"--axes {' '.join(names)}: each only once")
+    check_once("--axes", names)
     return tuple(known[name] for name in names)
 
 

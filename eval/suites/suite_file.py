@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arena_newton import rule_sets, tasks
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.records.schema import MAX_COUNT
 from arena_newton.files.stored_json import MAX_TEXT, Json, JsonObject, check_types, shown
@@ -172,9 +172,7 @@ def read_suite_file(path: Path) -> SuiteFile:
     if not entries:
         raise InputError(f"{path}: has no table [[policies]], name at least one")
     policies = tuple(_policy(f"{path}: [[policies]] {n + 1}", entry) for n, entry in enumerate(entries))
-    for number, entry in enumerate(policies):
-        if entry.name in [other.name for other in policies[:number]]:
-            raise InputError(f"{path}: [[policies]] {number + 1}: name {entry.name} is given twice")
+    check_once(f"{path}: [[policies]]: name", (entry.name for entry in policies))
     where = f"{path}: [matrix]"
     axes = MatrixAxes(**_values(where, _table(path, content, "matrix"), MatrixAxes))
     if axes.tasks == ("all",):
@@ -293,9 +291,7 @@ def _check_axes(where: str, axes: MatrixAxes | PolicyEntry, *, required: bool = 
         values = getattr(axes, key)
         if required and not values:
             raise InputError(f"{where}: {key} is empty, name at least one")
-        for value in values:
-            if list(values).count(value) > 1:
-                raise InputError(f"{where}: {key}: {value} is given twice")
+        check_once(f"{where}: {key}:", values)
     _check_names(f"{where}: tasks", axes.tasks, tasks.names())
     _check_names(f"{where}: modes", axes.modes, modes.names())
     for tracker in axes.trackers:
@@ -343,9 +339,7 @@ def _policy(where: str, table: Mapping[str, Json]) -> PolicyEntry:
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", tracker):
             raise InputError(f"{where}: trained_on is {shown(tracker)}, expected names of trackers")
     for key in ("trained_on", "trained_tasks"):
-        values = getattr(entry, key)
-        if len(set(values)) < len(values):
-            raise InputError(f"{where}: {key}: names one twice")
+        check_once(f"{where}: {key}:", getattr(entry, key))
     if entry.labels and entry.labels not in LABELS:
         raise InputError(f"{where}: labels is {shown(entry.labels)}, known are {' '.join(LABELS)}")
     for key in ("replan", "worlds"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from dataclasses import dataclass
 
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, UnknownName
 from arena_newton.eval.records.document import Identity
 from arena_newton.eval.records.journal import StorageError
 from arena_newton.files.stored_json import JsonObject
@@ -97,7 +97,8 @@ class Broke:
     """A batch ended early, or a process could not begin."""
 
     kind: str
-    """`input` and `storage` stop the run as such errors; `stop` stops it; of `broken` another attempt is made."""
+    """`unknown`, `input` and `storage` stop the run as such errors; `stop` stops it; of `broken` another attempt is
+    made."""
     message: str
     trace: str
 
@@ -109,7 +110,7 @@ def broke(error: BaseException) -> Broke:
     """Message about an exception that is being handled."""
     trace = traceback.format_exc()
     if isinstance(error, InputError):
-        return Broke("input", str(error), trace)
+        return Broke("unknown" if isinstance(error, UnknownName) else "input", str(error), trace)
     if isinstance(error, StorageError):
         return Broke("storage", str(error), trace)
     message = plain_text(f"{type(error).__name__}: {error}", 300)

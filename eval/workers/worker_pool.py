@@ -8,7 +8,6 @@ import functools
 import math
 import os
 import pickle
-import re
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from multiprocessing.reduction import ForkingPickler
 from typing import TYPE_CHECKING
 
-from arena_newton.errors import ArenaError, InputError
+from arena_newton.errors import ArenaError, InputError, UnknownName
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
@@ -48,8 +47,6 @@ POLL = 1.0
 """Deadlines and lost processes are looked at so often [s]."""
 PATIENCE = 30.0
 """While no process has begun, a line says so as often [s]."""
-UNKNOWN = re.compile(r"--\w+ \S+: unknown")
-"""Beginning of a process's message about a name that nobody offers in it."""
 
 
 @dataclass(eq=False)
@@ -185,9 +182,9 @@ class WorkerPool:
                 if worker.job is not job:
                     self.prepare(worker, job)
             for _, _, message in self.messages():
-                if isinstance(message, ArenaError) and (unknown := UNKNOWN.match(str(message))):  # but known here
-                    why = f"this program offers it in its own process alone, and {self.backend.flag} plays in others"
-                    raise InputError(f"{unknown[0]} there: {why}; offer it as an entry point") from message
+                if isinstance(message, UnknownName):  # but known here
+                    why = f"{self.backend.flag} plays in other processes than that of the program which offers it"
+                    raise InputError(f"{message}; {why}: make it an entry point") from message
                 if isinstance(message, ArenaError):
                     raise message
         return job.configured()
@@ -383,7 +380,7 @@ def _check_importable(factories: Factories | None, flag: str, names: Collection[
 
 def _error(message: Broke) -> ArenaError | None:
     """Error that playing again would not mend; None where it may."""
-    kinds = {"input": InputError, "storage": StorageError, "stop": RunStopped}
+    kinds = {"unknown": UnknownName, "input": InputError, "storage": StorageError, "stop": RunStopped}
     return kinds[message.kind](message.message) if message.kind in kinds else None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 from arena_newton.data.readers.label_protocols import protocol
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.files.own_files import replace_atomically
 from arena_newton.files.stored_json import Fit, loaded, read_object
 from arena_newton.files.text import plain_text
@@ -114,8 +114,8 @@ class CheckpointFacts:
         if facts.tracker_vector and not facts.task_vector:
             raise InputError(f"{path}: tracker_vector is given without a task_vector, which it is a part of")
         for key in ("task_vector", "tracker_vector", "tasks", "trackers"):
-            if key.endswith("vector") and len(set(getattr(facts, key))) < len(getattr(facts, key)):
-                raise InputError(f"{path}: {key} names a {key.removesuffix('_vector')} twice")
+            if key.endswith("vector"):
+                check_once(f"{path}: {key}:", getattr(facts, key))
             for name in getattr(facts, key):
                 if not _NAME.fullmatch(name):
                     raise InputError(f"{path}: {key} holds {plain_text(name, 60)!r}, which is no name")

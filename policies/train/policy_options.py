@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arena_newton.cli.flags import Device, Engine, Several, bounds, check_bounds
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.files.stored_json import check_types
 from arena_newton.pictures.settings import CAMERAS, FRONT
 from arena_newton.policies.chunk_flags import LABELS
@@ -224,10 +224,9 @@ def _task_numbers(
 ) -> dict[str, float]:
     """Numbers of tasks, typed as task=number; one without a task has none."""
     found: dict[str, float] = {}
+    check_once(f"{flag} for", (text.rpartition("=")[0] or "all" for text in given))
     for text in given:
         task, _, number = text.rpartition("=")
-        if task in found:
-            raise InputError(f"{flag} {text}: {task or 'a value for all'} is given twice")
         try:
             found[task] = float(number)
         except ValueError:

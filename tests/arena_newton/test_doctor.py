@@ -1,6 +1,8 @@
 """The doctor: extras, what of them works, and trackers and policies by name."""
 
 import importlib.util
+import runpy
+import sys
 import tomllib
 from pathlib import Path
 
@@ -93,6 +95,15 @@ def test_a_tracker_by_name(monkeypatch, capsys):
         assert capsys.readouterr().out.endswith("tracker pd: keeps all 13 promises\n")
     assert main(["doctor", "--tracker", "deaf"]) == 1
     assert "! targets " in (out := capsys.readouterr().out) and "expected a float32 tensor [3, 29]" in out
+
+
+def test_its_module_is_the_doctor(monkeypatch, capsys):
+    """`python -m arena_newton.doctor` is the command of that name, with all its flags."""
+    for arguments, said in (["--x"], "doctor --x: unknown"), (["--tracker"], "doctor --tracker: name the tracker"):
+        monkeypatch.setattr(sys, "argv", [doctor.__file__, *arguments])
+        with pytest.raises(SystemExit) as stopped:
+            runpy.run_path(doctor.__file__, run_name="__main__")
+        assert stopped.value.code == 2 and capsys.readouterr().err.startswith(f"error: {said}")
 
 
 def test_a_strangers_tracker_by_name(installed_falcon, shared, capsys):

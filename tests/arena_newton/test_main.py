@@ -19,7 +19,7 @@ SCRIPT = Path(sys.executable).with_name("arena-newton")
 
 
 def test_every_program_of_the_package_has_a_command():
-    """Modules that `python -m` runs have a command; builders, examples, processes of commands and front doors aside."""
+    """Modules that `python -m` runs are the commands'; builders, examples, processes of commands and doors aside."""
     doors = {
         "arena_newton/__main__.py",
         "arena_newton/files/sandboxed_load.py",
@@ -34,7 +34,7 @@ def test_every_program_of_the_package_has_a_command():
             name = path.resolve().relative_to(ROOT).as_posix()
             if 'if __name__ == "__main__":' in path.read_text() and name not in doors and "example" not in name:
                 programs.add("arena_newton." + name.removeprefix("arena_newton/")[:-3].replace("/", "."))
-    assert programs <= {command.module for command in COMMANDS}
+    assert programs == {command.module for command in COMMANDS}
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)

@@ -314,7 +314,7 @@ def test_a_quantity_is_added_to_a_mode_by_its_name():
         ("base+push=1\n", "expected a quantity"),
         ("base+push=nan", "expected a quantity"),
         ("base" + "+gains=1" * 20, "longer than 100 letters"),
-        ("base+push=1+push=2", "a quantity is given twice"),
+        ("base+push=1+push=2", "push: given twice"),
         ("base+weight=1", "weight is none of friction"),
         ("base+gyro_noise=-1", "gyro_noise: -1 to -1 is not a range of it"),
         ("night+push=1", "--mode night: unknown"),

@@ -81,8 +81,6 @@ def _named[T](
     """Files that a subcommand is given, and its flags."""
     if any(argument in HELP for argument in arguments):
         parse_flags(kind, ["--help"], f"{PROG} {command} {shown}")
-    if len(arguments) > 2 and arguments[0].startswith("--") and not arguments[-2].startswith("--"):
-        arguments = [arguments[-1], *arguments[:-1]]  # behind flags, each of which has a value
     files = folders_named(arguments, command, PROG, noun=noun, shown=shown, most=most)
     return files, parse_flags(kind, arguments, f"{PROG} {command}")
 

@@ -49,8 +49,10 @@ SCALED = 1e-12
 """Relative error of a scaled field: rounding."""
 SEMANTIC_LOSS = (3, 60)
 """Successes, of so many episodes, by which semantic mode may differ."""
-_UNSEEN = ("push_heading", "push_time", "picture_noise")
-"""Quantities that alone move no robot that stands."""
+_UNSEEN = ("push_heading", "push_time")
+"""Quantities that alone change nothing."""
+_PICTURED = "picture_noise"
+"""Quantity that changes pictures, and no robot that stands."""
 
 
 def visual(context: Context) -> CheckFinding:
@@ -310,7 +312,8 @@ def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS)
     alone = [key for key, end in ends.items() if end != usual[key] and key not in _UNSEEN]
     if not alone:
         return []
-    env = world_of(context, task, tracker, worlds=2 + len(alone))
+    camera = CameraConfig() if _PICTURED in alone else None
+    env = world_of(context, task, tracker, worlds=2 + len(alone), camera=camera)
     drawn = tasks.get(task).drawn(context.seeds(task, 1)[0], "base", rule_sets.get("paper").task(task))
     usual["push_time"] = PUSHED_AT / env.budget
     given = [{}, usual, *({**usual, key: ends[key]} for key in alone)]
@@ -320,6 +323,12 @@ def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS)
     env.reset(seeds, samples=[drawn | ({modes.DYNAMICS: sample} if sample else {}) for sample in given])
     for sample, model in zip(given, env.physics.models, strict=True):
         faults += [f"{field} is not as drawn" for field in _strays(built, model, env.scene.robot, usual | sample)]
+    if camera is not None:
+        shown = env.observe(image=True).image
+        assert shown is not None
+        for key, picture in zip(("usual values", *alone), shown[1:], strict=True):
+            if picture.equal(shown[0]) == (key == _PICTURED):
+                faults.append(f"{key}: the first picture is {'' if key == _PICTURED else 'not '}that of base mode")
     states = []
     for _ in range(env.startup_ticks + STOOD_TICKS):
         env.step(np.tile(np.asarray(STAND_ACTION, dtype=np.float32), (env.worlds, 1)))
@@ -330,8 +339,9 @@ def stand(context: Context, task: str, tracker: str, mode: str = modes.DYNAMICS)
         faults.append(f"usual values differ from base mode from tick {first_difference(base, plain)} on")
     for key, trace in zip(alone, others, strict=True):
         tick = first_difference(base, trace)
-        still = key == "object_mass"  # where no object moves, its mass changes nothing
-        if (tick is None and not still) or (key == "push" and tick != env.startup_ticks + PUSHED_AT):
+        # Where no object moves, its mass changes nothing.
+        strange = tick is not None if key == _PICTURED else tick is None and key != "object_mass"
+        if strange or (key == "push" and tick != env.startup_ticks + PUSHED_AT):
             faults.append(f"{key} acts from tick {tick} on")
     return [*dict.fromkeys(faults)]
 

@@ -9,6 +9,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.certification import certify
 from arena_newton.eval.certification.certify_options import CertifyOptions
 from arena_newton.eval.certification.checks.named_modes import drawn
+from arena_newton.physics.dynamics import SensorNoise
 from arena_newton.rules import modes, seeding
 from arena_newton.rules.modes import Mode
 from arena_newton.rules.rule_types import PoseRange
@@ -16,10 +17,13 @@ from arena_newton.rules.rule_types import PoseRange
 SEEDS = [seeding.episode_seed(tasks.get("football").gym_id, 0, repeat) for repeat in range(300)]
 DIM = Mode(
     name="dim",
-    sentence="a drawn light, a ball further to the left, and late actions",
+    sentence="a drawn light, a ball further to the left, grainy pictures, and late actions",
     placements=lambda rule: dataclasses.replace(rule.base, y=(1.0, 2.0)),
     light=lambda rules: rules.visual_light,
-    dynamics={"action_latency": (1, 3), "push": (0.5, 1.0), "push_heading": (0.0, 1.0), "push_time": (0.1, 0.2)},
+    dynamics={
+        **{"action_latency": (1, 3), "picture_noise": (2.0, 8.0)},
+        **{"push": (0.5, 1.0), "push_heading": (0.0, 1.0), "push_time": (0.1, 0.2)},
+    },
 )
 
 
@@ -46,17 +50,21 @@ def test_a_mode_moves_what_its_record_says(tmp_path, offered, capsys):
     """A mode of placements, a light and dynamics passes, and its line names each number that it moves."""
     assert certify.run(options(tmp_path, checks=("modes",), mode=(offered(DIM),))) == 0
     said = capsys.readouterr().out
-    numbers = "dynamics action_latency, dynamics push, dynamics push_heading, dynamics push_time, football y"
+    drawn_here = "action_latency", "picture_noise", "push", "push_heading", "push_time"
+    numbers = ", ".join([*(f"dynamics {name}" for name in drawn_here), "football y"])
     assert f"dim moves {numbers}, a drawn light; nothing else" in said
 
 
-def test_what_changes_more_than_its_record_says_is_found(tmp_path, offered, damped):
-    """Damping beside the friction that is drawn is found by the field that differs, and by the bits of base mode."""
+def test_what_changes_more_or_less_than_its_record_says_is_found(tmp_path, offered, damped, monkeypatch):
+    """Damping beside the friction that is drawn, noise of pictures that no picture has."""
     damped()
-    slick = offered(Mode(name="slick", sentence="slippery", dynamics={"friction": (0.2, 0.5)}))
+    monkeypatch.setattr(SensorNoise, "on_picture", lambda self, name, image, asked, tick: image)
+    ranges = {"friction": (0.2, 0.5), "picture_noise": (2.0, 8.0)}
+    slick = offered(Mode(name="slick", sentence="slippery and grainy", dynamics=ranges))
     assert certify.run(options(tmp_path, checks=("modes",), mode=(slick,))) == 1
     text = "".join(page.read_text() for page in tmp_path.glob("certify*.md")).replace("\\_", "_")
     assert "mode slick: football: dof_damping is not as drawn" in text
+    assert "mode slick: football: picture_noise: the first picture is that of base mode" in text
 
 
 def test_draws_that_are_not_the_record_s_are_found(offered, monkeypatch):

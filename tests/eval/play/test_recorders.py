@@ -97,15 +97,6 @@ def test_other_processes_give_the_same_metrics(measured, tmp_path, monkeypatch):
     }
 
 
-def test_a_name_that_other_processes_lack_is_explained():
-    """A recorder that a program registers is refused where others play, with what to do."""
-    pool, job = object.__new__(WorkerPool), SimpleNamespace(opened=None)
-    pool.backend, pool.workers = SimpleNamespace(flag="--jobs 2"), []
-    pool.messages = lambda: [(job, None, InputError("--recorder own: unknown recorder; known are speed"))]
-    with pytest.raises(InputError, match="--recorder own: unknown there: this program offers it .* as an entry point"):
-        pool.opened(job)
-
-
 def given(name, value):
     """Recorders that give one metric."""
 

@@ -135,7 +135,7 @@ def test_one_axis_is_a_map_of_one_row(tmp_path):
     ("flags", "message"),
     [
         (["--axes", "ball.x"], "--axes ball.x: task football draws football.x, football.y"),
-        (["--axes", "football.x", "football.x"], "--axes football.x football.x: each only once"),
+        (["--axes", "football.x", "football.x"], "--axes football.x: given twice"),
         (["--grid", "3", "3", "3"], "--grid 3 3 3: expected one number, or one for each of the 2 axes"),
         (["--grid", "0"], "--grid 0: expected at least 1"),
         (["--grid", "1000", "--repeats", "1"], "make 1,000,000 episodes, at most 200,000"),

@@ -10,12 +10,12 @@ import pytest
 from eval_fakes import factories
 
 from arena_newton import doctor
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, UnknownName
 from arena_newton.eval.folders.run_folder import ResultsFolder
 from arena_newton.eval.plan.config import resolve
 from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.run import RunStopped, check_parts
-from arena_newton.eval.workers.messages import Broke, Built, Done, Node, Opened, Ticks
+from arena_newton.eval.workers.messages import Broke, Built, Done, Node, Opened, Ticks, broke
 
 pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
@@ -236,6 +236,17 @@ def test_other_code_or_versions_are_refused(pool_of):
     pool, fake, _ = pool_of()
     fake.opened = Broke("input", "--policy x: no such file", "")
     with pytest.raises(InputError, match="^--policy x: no such file$"):
+        pool.opened(pool.job)
+
+
+def test_a_name_that_other_processes_lack_is_explained(pool_of):
+    """A name that a program registers is refused where others play, with what to do; other unknown values are not."""
+    pool, fake, _ = pool_of()
+    fake.opened = broke(UnknownName("--recorder own: unknown recorder; known are speed"))
+    with pytest.raises(InputError, match="own: unknown .*; --ray a:1 plays in other processes .* an entry point"):
+        pool.opened(pool.job)
+    fake.opened = broke(InputError("--device gpu: unknown, choose cpu, cuda or cuda:N"))
+    with pytest.raises(InputError, match="^--device gpu: unknown, choose cpu, cuda or cuda:N$"):
         pool.opened(pool.job)
 
 

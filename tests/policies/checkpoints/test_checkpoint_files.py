@@ -193,7 +193,7 @@ WRONG = {
     "no number": (lambda f: edit(f / "config.json", dropout=float("nan")), "config.json: dropout is nan"),
     "a task twice": (
         lambda f: edit(f / "arena_policy.json", task_vector=["boxing", "boxing"]),
-        "task_vector names a task twice",
+        "task_vector: boxing: given twice",
     ),
     "statistics of another shape": (other_statistics, "its processors or their statistics do not fit"),
     "no device": (lambda f: without_device(f / "policy_preprocessor.json"), "steps hold no device_processor"),

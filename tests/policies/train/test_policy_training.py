@@ -450,7 +450,7 @@ BAD = [
     (["--balance", "task", "--task-weights", "football=2"], "--task-weights football: the datasets have boxing"),
     (["--look-changes", "light=0"], "--look-changes: belongs to --looks, which is not given"),
     (["--looks", "1", "--look-changes", "light"], "--look-changes light: expected a kind of change and a probability"),
-    (["--looks", "1", "--look-changes", "light=0", "light=1"], "--look-changes light=1: light is given twice"),
+    (["--looks", "1", "--look-changes", "light=0", "light=1"], "--look-changes for light: given twice"),
     (["--looks", "1", "--look-changes", "light=nan"], "--look-changes light=nan: expected a kind of change"),
     (["--recipe-values", "colour=NaN"], "--recipe-values: colour is NaN, expected float"),
     (["--recipe-values", "shift_px=-3"], "recipe act/small: shift_px is -3, expected 0 or more"),

@@ -542,7 +542,7 @@ def test_mistakes_answer_in_one_line(tmp_path, capsys, monkeypatch):
         (["--library", str(tmp_path / "none.npz"), "--device", "cpu"], "no such file"),
         (["--rewards", "nonsense", "1.0"], "nonsense"),
         (["export", str(tmp_path / "bad.pt"), "--out", str(tmp_path / "x.safetensors")], "not a training checkpoint"),
-        (["export", "--out", str(tmp_path / "x.safetensors"), str(tmp_path / "bad.pt")], "not a training checkpoint"),
+        (["export", "--out", "x.safetensors", "bad.pt"], "export: name the checkpoint: "),
         (["--resume", str(tmp_path / "bad.pt"), "--device", "cpu"], "--resume"),
         (["--families", "stnd", "3", "--device", "cpu"], "--families"),
         (["--events", "push", "planar", "3", "--no-randomise", "--device", "cpu"], "--events: sets"),

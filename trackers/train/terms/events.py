@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from arena_newton.cli.flags import check_number
-from arena_newton.errors import InputError
+from arena_newton.errors import InputError, check_once
 from arena_newton.robot.g1 import TICK
 from arena_newton.rules.modes import MOST_LATENCY
 
@@ -229,6 +229,7 @@ def configured(changes: Sequence[tuple[str, str, float]]) -> dict[str, Event]:
     Raises:
         InputError: An event or a setting is unknown, a setting is given twice, or a value is unfit for it.
     """
+    check_once("--events", (f"{name} {key}" for name, key, _ in changes))
     events = dict(EVENTS)
     for name, key, value in changes:
         if name not in events:
@@ -237,8 +238,6 @@ def configured(changes: Sequence[tuple[str, str, float]]) -> dict[str, Event]:
         if key not in settings:
             raise InputError(f"--events {name} {key}: no such setting; {name} has {', '.join(settings)}")
         flag = f"--events {name} {key}"
-        if [change[:2] for change in changes].count((name, key)) > 1:
-            raise InputError(f"{flag}: given twice")
         check_number(flag, value, *BOUNDS.get(key, (0.0, 1e3)))
         if key == "ticks" and not float(value).is_integer():
             raise InputError(f"{flag} {value}: expected a whole number")
