@@ -3,7 +3,8 @@
 A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
 work can be captured in a CUDA graph (`torch.where` with a number cannot: it would copy that to the device). Texture and
 shading of a shape stay: each pixel's luminance over the mean of its shape times the new colour. The robot and shapes
-whose colour matters keep theirs, and nothing is put before them.
+whose colour matters keep theirs, nothing is put before them, and nothing else gets a colour like it: a policy that is
+sent to the green target would learn not to trust green.
 
 What semantic mode shows is not among the looks: every drawn colour is one of `palette`, which keeps its distance from
 `SEMANTIC_COLOURS`; so a brick is never drawn in the colour of that mode's bricks. Lights are those of the recording.
@@ -21,8 +22,8 @@ import torch
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
 
-__all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "hue_lacks", "luminance", "palette", "recoloured"]
-__all__ += ["seen_colours"]
+__all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "goal_colour", "hue_lacks", "luminance", "palette"]
+__all__ += ["recoloured", "seen_colours", "unlike"]
 
 SEMANTIC_COLOURS = (
     (0.05, 0.85, 0.1),  # the cube on the bag
@@ -71,8 +72,12 @@ FACINGS = (0.45, 0.6, 0.725, 0.85, 1.0)
 """Light of the dome on surfaces that face down to up (`BOUNCE` to 1)."""
 LUMA = (77.0, 150.0, 29.0)
 """Weights of red, green and blue in luminance, of 256 (Rec. 601)."""
-SHAPES = 256
-"""Values of a byte that names a shape."""
+SHAPES, FIRST_SHAPE = 256, 2
+"""Values of a byte that names a shape, and the first of them that is neither background nor robot."""
+LEAST_CHROMA = 0.08
+"""Distance of a goal's colour from grey, in RGB from 0 to 1, from which its hue tells it apart."""
+LIKE_HUE, LIKE_CHROMA = 0.8, 1 / 3
+"""A colour is like a goal's within 37° of its hue (the cosine) and from a third of its distance from grey on."""
 
 
 @dataclass(frozen=True)
@@ -131,11 +136,41 @@ def palette(device: torch.device) -> torch.Tensor:
     return torch.from_numpy(drawn[apart][:COLOURS].astype(np.float32)).to(device)
 
 
+def goal_colour(seen: torch.Tensor, shapes: torch.Tensor, chances: torch.Tensor) -> torch.Tensor:
+    """Mean colour of the shapes that keep theirs, sRGB from 0 to 1, shape [3]; grey where no picture shows one.
+
+    Args:
+        seen: Pictures, uint8, shape [n, H, W, 3].
+        shapes: Shape of each pixel, uint8, shape [n, H, W].
+        chances: Probability of another colour of each shape, float32, shape [256].
+    """
+    goal = (shapes >= FIRST_SHAPE) & (chances[shapes.long()] == 0.0)
+    return seen[goal].float().mean(dim=0).div(255.0).nan_to_num(0.5)
+
+
+def unlike(goal: torch.Tensor) -> torch.Tensor:
+    """Colours that may be drawn beside a goal that is told apart by its colour.
+
+    Args:
+        goal: Its mean colour in pictures, sRGB from 0 to 1, shape [3]; grey excludes none.
+
+    Returns:
+        Numbers of colours of `palette`, int64, shape [4096]: in place of those that are like the goal's, others again.
+    """
+    drawn, wanted = (colour - colour.mean(dim=-1, keepdim=True) for colour in (palette(goal.device), goal))
+    length, least = torch.linalg.vector_norm(drawn, dim=1), torch.linalg.vector_norm(wanted)
+    like = (drawn @ wanted > LIKE_HUE * length * least) & (length > LIKE_CHROMA * least) & (least > LEAST_CHROMA)
+    number = torch.arange(COLOURS, device=goal.device)
+    others = number[~like]
+    return torch.where(like, others[number % len(others)], number)
+
+
 def changed_looks(
     seen: torch.Tensor,
     frames: torch.Tensor,
     chances: torch.Tensor,
     objects: torch.Tensor,
+    colours: torch.Tensor,
     task: torch.Tensor,
     changes: Changes = USUAL,
 ) -> torch.Tensor:
@@ -147,6 +182,7 @@ def changed_looks(
             (`data.readers.looks`).
         chances: Probability of another colour of each shape, float32, shape [B, 256].
         objects: First shape of the object that each shape is part of, int64, shape [B, 256].
+        colours: Colours that may be drawn, as of `unlike`, int64, shape [B, 4096].
         task: Number of each sample's task, int64, shape [B]; things are cut out of another task's pictures.
         changes: Probabilities.
 
@@ -156,16 +192,15 @@ def changed_looks(
     batch, height, width = seen.shape[:3]
     device = seen.device
     shapes = frames[..., 0].reshape(batch, -1).long()
-    own = chances.gather(1, shapes)
-    chance = own + ((own > 0.0) & (own < 1.0)) * (changes.key_objects - own)
+    free = chances.gather(1, shapes) >= 1.0
+    chance = chances + ((chances > 0.0) & (chances < 1.0)) * (changes.key_objects - chances)
     luma = luminance(seen).reshape(batch, -1)
     pixels = seen.reshape(batch, -1, 3).float() / 255.0
-    owner = objects.gather(1, shapes)
-    pixels = recoloured(pixels, luma, shapes, owner, chance, (height, width), changes)
-    free = own >= 1.0
-    pixels = _with_things(pixels, luma, owner, chance, free, task, (height, width), changes.things)
+    pixels = recoloured(pixels, luma, shapes, objects, chance, colours, (height, width), changes)
+    things = objects.gather(1, shapes), (chance > 0.0).gather(1, shapes)
+    pixels = _with_things(pixels, luma, things, free, colours, task, (height, width), changes.things)
     inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
-    pixels = torch.where(inside[..., None], _colours((batch, 1), device), pixels)
+    pixels = torch.where(inside[..., None], _colours(1, colours), pixels)
     lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., -1]).float()
     ratio = torch.exp2((lit.reshape(batch, -1) - 128.0) / 32.0)
     weight = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.light, device)
@@ -177,8 +212,9 @@ def recoloured(
     pixels: torch.Tensor,
     luma: torch.Tensor,
     shapes: torch.Tensor,
-    owner: torch.Tensor,
+    objects: torch.Tensor,
     chance: torch.Tensor,
+    colours: torch.Tensor,
     size: tuple[int, int],
     changes: Changes,
 ) -> torch.Tensor:
@@ -188,8 +224,9 @@ def recoloured(
         pixels: 0 to 1, shape [B, P, 3].
         luma: Luminance of each pixel, 0 to 255, int64, shape [B, P].
         shapes: Shape of each pixel, int64, shape [B, P].
-        owner: Object of each pixel, int64, shape [B, P].
-        chance: Probability of another colour, shape [B, P].
+        objects: Object of each shape, int64, shape [B, 256].
+        chance: Probability of another colour of each shape, shape [B, 256].
+        colours: As in `changed_looks`.
         size: Height and width, whose product is P.
         changes: Probabilities.
 
@@ -197,13 +234,14 @@ def recoloured(
         Pixels of the same shape.
     """
     batch, device = len(pixels), pixels.device
-    part = torch.where(torch.rand((batch, 1), device=device) < 0.5, owner, shapes)
+    parts = torch.where(torch.rand((batch, 1), device=device) < 0.5, objects, torch.arange(SHAPES, device=device))
     rate = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.colours, device)
-    mine = torch.rand((batch, SHAPES), device=device).gather(1, part) < rate * chance
-    which = _pattern(part, size, changes.patterns)
-    chosen = torch.randint(0, COLOURS, (batch, 3 * SHAPES), device=device).gather(1, 3 * part + which)
+    mine = torch.rand((batch, SHAPES), device=device).gather(1, parts) < rate * chance
+    part = parts.gather(1, shapes)
+    which = 3 * part + _pattern(part, size, changes.patterns)
+    chosen = _colours(3 * SHAPES, colours).take_along_dim(which[..., None], 1)
     shade = _shade(luma, part)[..., None]
-    return torch.where(mine[..., None], (palette(device)[chosen] * shade).clamp_(0.0, 1.0), pixels)
+    return torch.where(mine.gather(1, shapes)[..., None], (chosen * shade).clamp_(0.0, 1.0), pixels)
 
 
 @functools.cache
@@ -237,9 +275,10 @@ def _happens(batch: int, probability: float, device: torch.device) -> torch.Tens
     return torch.rand((batch, 1), device=device) < probability
 
 
-def _colours(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Colours of the palette, shape [*shape, 3]."""
-    return palette(device)[torch.randint(0, COLOURS, shape, device=device)]
+def _colours(count: int, colours: torch.Tensor) -> torch.Tensor:
+    """Colours of the palette for each sample, of those that it may get, shape [B, count, 3]."""
+    device = colours.device
+    return palette(device)[colours.gather(1, torch.randint(0, COLOURS, (len(colours), count), device=device))]
 
 
 def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> torch.Tensor:
@@ -291,19 +330,23 @@ def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> t
 def _with_things(
     pixels: torch.Tensor,
     luma: torch.Tensor,
-    owner: torch.Tensor,
-    chance: torch.Tensor,
+    things: tuple[torch.Tensor, torch.Tensor],
     free: torch.Tensor,
+    colours: torch.Tensor,
     task: torch.Tensor,
     size: tuple[int, int],
     probability: float,
 ) -> torch.Tensor:
-    """Put something out of another sample's picture somewhere, in another colour, behind what must stay visible."""
+    """Put something out of another sample's picture somewhere, in another colour, behind what must stay visible.
+
+    Args:
+        things: Of each pixel: its object, and whether that may get another colour; both of shape [B, P].
+    """
     (height, width), (batch, count), device = size, luma.shape, luma.device
     other = torch.randint(0, batch, (batch,), device=device)
     at = torch.randint(0, count, (batch, 1), device=device)
-    theirs, bright = owner[other], luma[other]
-    thing = (theirs == theirs.gather(1, at)) & (chance[other] > 0.0)
+    theirs, movable, bright = things[0][other], things[1][other], luma[other]
+    thing = (theirs == theirs.gather(1, at)) & movable
     area = thing.float().mean(dim=1, keepdim=True)
     fits = (area > 0.001) & (area < 0.15) & (task[other] != task)[:, None] & _happens(batch, probability, device)
     mean = (bright * thing).sum(dim=1, keepdim=True) / thing.sum(dim=1, keepdim=True).clamp_min(1)
@@ -315,7 +358,7 @@ def _with_things(
     source = down.clamp(0, height - 1)[:, :, None] * width + right.clamp(0, width - 1)[:, None, :]
     source = source.reshape(batch, -1)
     put = thing.gather(1, source) & within.reshape(batch, -1) & free & fits
-    colour = _colours((batch, 1), device) * shade.gather(1, source)[..., None]
+    colour = _colours(1, colours) * shade.gather(1, source)[..., None]
     return torch.where(put[..., None], colour.clamp_(0.0, 1.0), pixels)
 
 

@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom, UsdShade
 
 from arena_newton.physics.scene import SCENES
 from arena_newton.pictures import changed_looks as looks
-from arena_newton.pictures.changed_looks import Changes, changed_looks, palette, recoloured, seen_colours
+from arena_newton.pictures.changed_looks import Changes, changed_looks, palette, recoloured, seen_colours, unlike
 
 CPU = torch.device("cpu")
 BATCH, HEIGHT, WIDTH = 32, 24, 32
@@ -32,9 +32,9 @@ def batch():
     frames[:, :2, :, 0] = 0
     chances = torch.zeros(BATCH, 256)
     chances[:, SELDOM], chances[:, WALL], chances[:, FLOOR] = 0.15, 1.0, 1.0
-    objects = torch.arange(256).expand(BATCH, -1)
+    objects, colours = torch.arange(256).expand(BATCH, -1), torch.arange(looks.COLOURS).expand(BATCH, -1)
     task = torch.arange(BATCH) % 2
-    return torch.from_numpy(seen), torch.from_numpy(frames), chances, objects, task
+    return torch.from_numpy(seen), torch.from_numpy(frames), chances, objects, colours, task
 
 
 def differ(pictures, seen):
@@ -107,15 +107,14 @@ def test_no_drawn_colour_is_one_of_semantic_modes():
 
 def test_shapes_get_colours_of_the_palette_alone(batch):
     """Every colour in 2,000 looks of evenly lit shapes is one of the palette."""
-    seen, frames, chances, objects, _ = batch
+    seen, frames, chances, objects, colours, _ = batch
     torch.manual_seed(0)
     known = set(coded(palette(CPU)).tolist())
     even, shapes = torch.full_like(seen, 120), frames[..., 0].reshape(BATCH, -1).long()
     pixels, luma = even.reshape(BATCH, -1, 3) / 255.0, looks.luminance(even).reshape(BATCH, -1)
     patterned, drawn = 0, set()
     for _ in range(2000 // BATCH):
-        owner, chance = objects.gather(1, shapes), chances.gather(1, shapes)
-        found = recoloured(pixels, luma, shapes, owner, chance, (HEIGHT, WIDTH), STILL)
+        found = recoloured(pixels, luma, shapes, objects, chances, colours, (HEIGHT, WIDTH), STILL)
         changed = (found != pixels).any(dim=2)
         drawn |= set(coded(found[changed]).unique().tolist())
         codes = torch.where(shapes == WALL, coded(found), -1)
@@ -153,6 +152,32 @@ def test_what_a_hand_must_find_changes_as_often_as_is_asked(batch):
         )
         assert not any(one[shapes <= KEPT].any() for one in changed)
         assert found == 0.0 if asked == 0.0 else abs(found - walls) < 0.2, (found, walls)
+
+
+def test_nothing_gets_the_colour_of_a_goal_that_is_told_by_it(batch):
+    """Beside a green goal no shape, thing or rectangle is drawn in a green; beside a grey one all colours may be."""
+    seen, frames, chances, *rest = batch
+    goal = looks.goal_colour(seen, frames[..., 0], chances[0])
+    assert torch.equal(goal, seen[frames[..., 0] == KEPT].float().mean(0) / 255.0)
+    assert torch.equal(unlike(goal), torch.arange(looks.COLOURS))  # noise about a grey
+    green = unlike(torch.tensor([0.25, 0.75, 0.3]))
+    drawn = palette(CPU)[green]
+    greens = int(greenness(palette(CPU)).sum())
+    assert not greenness(drawn).any() and 200 < greens < 600 and len(green.unique()) > 3400
+    even = Changes(colours=1.0, light=0.0, exposure=0.0, things=1.0, rectangles=1.0)
+    allowed, plain = [green.expand(BATCH, -1), *rest[2:]], [*rest[1:]]
+    torch.manual_seed(7)
+    found = [
+        changed_looks(torch.full_like(seen, 120), frames, chances, rest[0], *one, even) for one in (allowed, plain)
+    ]
+    assert not greenness(found[0]).any() and greenness(found[1]).any()
+
+
+def greenness(colours):
+    """Colours whose hue is within 30° of green and that are far from grey, sRGB from 0 to 1, shape [..., 3]."""
+    red, green, blue = colours.unbind(-1)
+    least = colours.min(dim=-1).values
+    return (green - least > 0.25) & (torch.maximum(red, blue) - least < 0.5 * (green - least))
 
 
 def test_texture_and_shading_stay(batch):

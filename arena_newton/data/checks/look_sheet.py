@@ -10,7 +10,7 @@ import torch
 
 from arena_newton.data.readers.frame_reader import OpenVideo
 from arena_newton.data.readers.looks import Looks
-from arena_newton.pictures.changed_looks import changed_looks
+from arena_newton.pictures.changed_looks import changed_looks, goal_colour, unlike
 
 __all__ = ["changed_rows"]
 
@@ -37,9 +37,9 @@ def changed_rows(
         video.close()
     chances = torch.from_numpy(looks.chances()).expand(len(rows), -1)
     objects = torch.from_numpy(looks.objects()).expand(len(rows), -1)
-    number, seen = torch.arange(len(rows)), torch.from_numpy(np.stack(pictures))
+    number, seen, shown = torch.arange(len(rows)), torch.from_numpy(np.stack(pictures)), torch.from_numpy(frames)
+    colours = unlike(goal_colour(seen, shown[..., 0], chances[0])).expand(len(rows), -1)
     with torch.random.fork_rng([]):
         torch.manual_seed(len(rows))
-        shown = torch.from_numpy(frames)
-        changed = [changed_looks(seen, shown, chances, objects, number) for _ in range(count)]
+        changed = [changed_looks(seen, shown, chances, objects, colours, number) for _ in range(count)]
     return [list((255.0 * one).round().byte().numpy()) for one in changed]

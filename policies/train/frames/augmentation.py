@@ -60,7 +60,7 @@ def gathered_pictures(
         first = max(0, (store.height - tall) // 2 - store.top)
         frames = looks.frames[:, first : first + height][looks.number[rows].clamp_min(0)[:, None, None], *window]
         table = looks.table[rows]
-        about = looks.chances[table], looks.objects[table], store.task[rows]
+        about = looks.chances[table], looks.objects[table], looks.colours[table], store.task[rows]
         other = changed_looks(seen, frames, *about, looks.changes)
         pictures = torch.where(changed[:, None, None, None], other, pictures)
     pictures = pictures.permute(0, 3, 1, 2)

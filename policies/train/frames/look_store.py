@@ -15,12 +15,15 @@ import torch
 from arena_newton.data.readers.dataset_files import DatasetFiles
 from arena_newton.data.readers.looks import dataset_looks
 from arena_newton.errors import InputError
-from arena_newton.pictures.changed_looks import USUAL, Changes
+from arena_newton.pictures.changed_looks import USUAL, Changes, goal_colour, unlike
 from arena_newton.policies.train.frames.decoder_pool import DecoderPool, EpisodeFilm, decoding_processes
 from arena_newton.policies.train.frames.demonstration_rows import DatasetRows
 from arena_newton.policies.train.frames.frame_store import FrameStore, free_memory
 
 __all__ = ["LookStore", "load_looks"]
+
+GOAL_EVERY = 20
+"""Frames of a scene of which one is read for the mean colour of its goal."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class LookStore:
     """Probability of another colour of each shape, float32, shape [tables, 256]."""
     objects: torch.Tensor
     """First shape of the object that each shape is part of, int64, shape [tables, 256]."""
+    colours: torch.Tensor
+    """Colours of the palette that are not like the goal's, int64, shape [tables, 4096]."""
     fractions: torch.Tensor
     """Fraction of the samples of each row's task whose looks change, float32, shape [rows]."""
     changes: Changes = USUAL
@@ -132,14 +137,22 @@ def load_looks(
     with DecoderPool(height, width, threads=cores, processes=processes, device=device) as pool:
         for _ in pool.decode(films, store.top, store.bottom, put):
             pass
+    kept, picture = torch.from_numpy(np.stack(chances)).to(device), store.picture.cpu().numpy()
+    colours = []
+    for one in range(len(chances)):
+        shown = np.flatnonzero((table == one) & (number >= 0) & (back == 0))[::GOAL_EVERY]
+        shapes = stored[torch.from_numpy(number[shown]).to(device)][..., 0]
+        seen = store.pictures[torch.from_numpy(picture[shown]).to(device)]
+        colours.append(unlike(goal_colour(seen, shapes, kept[one])))
     shares = torch.tensor([fractions.get(task, fraction) for task in store.tasks], device=device)
     return LookStore(
         frames=stored,
         number=torch.from_numpy(number).to(device),
         back=torch.from_numpy(back).to(device),
         table=torch.from_numpy(table).to(device),
-        chances=torch.from_numpy(np.stack(chances)).to(device),
+        chances=kept,
         objects=torch.from_numpy(np.stack(objects)).to(device),
+        colours=torch.stack(colours),
         fractions=shares[store.task],
         changes=Changes(**changes),
     )
