@@ -2,7 +2,7 @@
 
 Shows: the exact gradient from a margin to all of an episode's actions; values come from the engine. A minute on a CPU.
 
-    python examples/refine_reference.py --shown 8 --wanted 0
+    python examples/refine_reference.py --shown 0 --wanted 16
 """
 
 import argparse
@@ -21,16 +21,15 @@ WRISTS, JOINTS = ("left_wrist_yaw_link", "right_wrist_yaw_link"), canonical.ACTI
 def main() -> None:
     """Demonstrate, then play and refine."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--shown", type=int, default=8, help="repeat of the plan whose expert is recorded")
-    parser.add_argument("--wanted", type=int, default=0, help="repeat at which its actions must succeed")
-    parser.add_argument("--max-steps", type=int, default=None, help="ticks of 0.02 s; the task's own budget by default")
+    parser.add_argument("--shown", type=int, default=0, help="repeat of the plan whose expert is recorded")
+    parser.add_argument("--wanted", type=int, default=16, help="repeat at which its actions must succeed")
     parser.add_argument("--rounds", type=int, default=8, help="plays at most")
     args = parser.parse_args()
     env = ArenaEnv("boxing", tracker=trackers.get("sonic"), worlds=1, engine="mujoco")
     plan = expand(["boxing"], trackers=["sonic"], policy="expert", seeds=[0], repeats=20)
     kept: list[torch.Tensor] = []
     keep = lambda env, action: kept.append(action.clone()) or action  # type: ignore[func-returns-value]  # noqa: E731
-    Rollout(env, policies.get("expert"), plan[args.shown :][:1], disturbance=keep, max_steps=args.max_steps).run()
+    Rollout(env, policies.get("expert"), plan[args.shown :][:1], disturbance=keep).run()
     actions = torch.cat(kept[env.startup_ticks :] + kept[-1:] * 15)
     rule = {name: getattr(env.judge, name) for name in ("palm_body", "palm_offset", "target")}
     bodies = torch.tensor([env.scene.link(name) for name in WRISTS])

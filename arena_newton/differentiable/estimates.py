@@ -83,7 +83,7 @@ class Reach(NamedTuple):
     far: torch.Tensor
     """Central differences at the larger scale."""
     holds: torch.Tensor
-    """True where both differences agree with the slope: bool."""
+    """True where both differences agree with the slope: bool. Never where one is not finite, as where a world fell."""
 
 
 def reach(
@@ -108,8 +108,10 @@ def reach(
         tolerance: Difference that is no contradiction, as a fraction of the larger of slope and difference.
     """
     near, far = (central_differences(function, at, scale, rows=rows).gradient for scale in scales)
-    agree = [(one - slope).abs() <= tolerance * torch.maximum(one.abs(), slope.abs()) for one in (near, far)]
-    return Reach(slope, near, far, agree[0] & agree[1])
+    holds = torch.ones_like(slope, dtype=torch.bool)
+    for one in (near, far):
+        holds &= one.isfinite() & ((one - slope).abs() <= tolerance * torch.maximum(one.abs(), slope.abs()))
+    return Reach(slope, near, far, holds)
 
 
 def cross_entropy(

@@ -63,6 +63,7 @@ def check(m: mujoco.MjModel) -> None:
         m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT,
         m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED,
         m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
+        np.isclose(m.actuator_biasprm[:, 1], -m.actuator_gainprm[:, 0]),  # a velocity drive has gain kd, and no kp
         m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE,
         m.actuator_gear[:, 0] == 1.0,
         ~(m.actuator_forcelimited | m.actuator_ctrllimited).astype(bool),

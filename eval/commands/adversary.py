@@ -40,7 +40,7 @@ class AdversaryOptions(PlacementOptions):
     search_seed: int = 0
     """Seed of the search itself."""
     out: str | None = None
-    """Folder to write, which must not exist; results/adversary_<task>_<tracker>_<mode> when none is named."""
+    """Folder to write, or to go on with; results/adversary_<task>_<tracker>_<mode> when none is named."""
 
 
 def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
@@ -53,17 +53,20 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
         InputError: A flag is unfit; raised before the first episode.
         StorageError: A file cannot be written.
     """
-    from arena_newton.eval.records.journal import write_atomic
-    from arena_newton.eval.studies.placed_play import PlacedWorlds, placement_run
-    from arena_newton.eval.studies.placement_files import PlacedStudy, point_rows, study_folder, summary_json, tallies
-    from arena_newton.eval.studies.worst_placement import score_of, search, worst_of
+    from arena_newton.eval.studies.placement_run import placement_run
 
     config, axes = placement_run(options)
     _check(options)
     confirming, _ = placement_run(dataclasses.replace(options, seed=options.seed + 1, repeats=options.confirm))
-    with PlacedWorlds(config, axes, factories) as worlds:
-        folder = study_folder(options.out, "adversary", config.flags.task[0], options.tracker, options.mode)
-        with PlacedStudy(worlds, folder, _episodes(options)) as study:
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.studies.placed_play import PlacedWorlds
+    from arena_newton.eval.studies.placement_files import PlacedStudy, point_rows, study_folder, summary_json, tallies
+    from arena_newton.eval.studies.worst_placement import score_of, search, worst_of
+
+    words = "adversary", config.flags.task[0], options.tracker, options.mode
+    asked = {name: getattr(options, name) for name in ("batch", "batches", "confirm", "search_seed")}
+    with PlacedWorlds(config, axes, factories) as worlds, study_folder(options.out, *words) as folder:
+        with PlacedStudy(worlds, folder, _episodes(options), method="adversary", **asked) as study:
 
             def scores(points: list[Point]) -> list[float]:
                 results, each = study.play(points), options.repeats
@@ -98,7 +101,7 @@ def run(options: AdversaryOptions, factories: Factories | None = None) -> int:
 
 
 def _check(options: AdversaryOptions) -> None:
-    from arena_newton.eval.studies.placed_play import MOST_EPISODES
+    from arena_newton.eval.studies.placement_run import MOST_EPISODES
 
     check_least(options, 10, "batch")
     check_least(options, 1, "batches", "confirm")

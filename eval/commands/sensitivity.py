@@ -46,11 +46,12 @@ class SensitivityOptions(PlacementOptions):
     grid: Several[int] = (7, 7)
     """Points along each axis, the ends of its range among them."""
     out: str | None = None
-    """Folder to write, which must not exist; results/sensitivity_<task>_<tracker>_<mode> when none is named."""
+    """Folder to write, or to go on with; results/sensitivity_<task>_<tracker>_<mode> when none is named. Slopes of the
+    same run may be added to a grid's folder: its page shows both."""
 
 
 def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
-    """Play the grid; write episodes.csv, sensitivity.csv, sensitivity.json and sensitivity.png; print what was found.
+    """Play the grid; write its page, picture, tables and episodes; print what was found.
 
     Returns:
         Exit code: 0, or 1 when an episode ended with an error.
@@ -59,11 +60,7 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
         InputError: A flag is unfit; raised before the first episode.
         StorageError: A file cannot be written.
     """
-    from arena_newton.eval.records.journal import write_atomic
-    from arena_newton.eval.studies.placed_play import MOST_EPISODES, PlacedWorlds, placement_run
-    from arena_newton.eval.studies.placement_files import PlacedStudy, point_rows, study_folder, summary_json, tallies
-    from arena_newton.eval.studies.placement_map import draw_grid
-    from arena_newton.eval.tables.suite_figures import save
+    from arena_newton.eval.studies.placement_run import MOST_EPISODES, placement_run
 
     config, all_axes = placement_run(options)
     if options.method == "adjoint":
@@ -76,32 +73,38 @@ def run(options: SensitivityOptions, factories: Factories | None = None) -> int:
     count = len(points) * len(config.episodes)
     if count > MOST_EPISODES:
         raise InputError(f"--grid and --repeats: make {count:,} episodes, at most {MOST_EPISODES:,}")
-    with PlacedWorlds(config, axes, factories) as worlds:
-        folder = study_folder(options.out, "sensitivity", config.flags.task[0], options.tracker, options.mode)
-        with PlacedStudy(worlds, folder, count) as study:
+    from arena_newton.eval.records.journal import write_atomic
+    from arena_newton.eval.studies.placed_play import PlacedWorlds
+    from arena_newton.eval.studies.placement_files import PlacedStudy, point_rows, study_folder, summary_json, tallies
+    from arena_newton.eval.studies.placement_map import draw_grid
+    from arena_newton.eval.studies.placement_page import write_page
+    from arena_newton.eval.tables.suite_figures import save
+
+    words = "sensitivity", config.flags.task[0], options.tracker, options.mode
+    with PlacedWorlds(config, axes, factories) as worlds, study_folder(options.out, *words) as folder:
+        with PlacedStudy(worlds, folder, count, method="grid", grid=grid) as study:
             study.play(points)
-    found = tallies(study.results)
-    write_atomic(folder / "sensitivity.csv", point_rows(axes, found))
-    successes, judged = sum(one.successes for one in found), sum(one.judged for one in found)
-    described = [
-        dataclasses.asdict(axis) | {"name": axis.name, "grid": values} for axis, values in zip(axes, grid, strict=True)
-    ]
-    counts = {"interval": wilson(successes, judged), "points": [one.to_json() for one in found]}
-    document = summary_json(FORMAT, options, described, successes=successes, judged=judged, **counts)
-    write_atomic(folder / "sensitivity.json", document)
-    title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
-    save(draw_grid(axes, grid, found, title), folder / "sensitivity.png")
-    print("\n".join(summary(axes, found)))
-    print(f"written: {folder / 'sensitivity.png'}, sensitivity.csv, sensitivity.json, episodes.csv")
+        found = tallies(study.results)
+        write_atomic(folder / "sensitivity.csv", point_rows(axes, found))
+        successes, judged = sum(one.successes for one in found), sum(one.judged for one in found)
+        described = [
+            dataclasses.asdict(axis) | {"name": axis.name, "grid": values}
+            for axis, values in zip(axes, grid, strict=True)
+        ]
+        lines = summary(axes, found)
+        counts = {"interval": wilson(successes, judged), "points": [one.to_json() for one in found], "summary": lines}
+        document = summary_json(FORMAT, options, described, successes=successes, judged=judged, **counts)
+        write_atomic(folder / "sensitivity.json", document)
+        title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
+        save(draw_grid(axes, grid, found, title), folder / "sensitivity.png")
+        page = write_page(folder, title)
+    print("\n".join(lines))
+    print(f"written: {page}, sensitivity.png, sensitivity.csv, sensitivity.json, episodes.csv")
     return 1 if any(one.errors for one in found) else 0
 
 
 def _adjoint(options: SensitivityOptions, config: RunConfig, axes: Sequence[Axis], factories: Factories | None) -> int:
     """Write and print the slopes of one episode."""
-    from arena_newton.eval.play.factories import Factories
-    from arena_newton.eval.studies.adjoint_slopes import play_slopes
-    from arena_newton.eval.studies.placed_play import PlacedWorlds
-    from arena_newton.eval.studies.placement_files import study_folder
     from arena_newton.rules.modes import DYNAMICS
 
     scales = options.reach
@@ -111,10 +114,19 @@ def _adjoint(options: SensitivityOptions, config: RunConfig, axes: Sequence[Axis
     if options.repeats != 1 or options.latency_ticks:
         raise InputError("--method adjoint: one episode without latency has slopes, not --repeats or --latency-ticks")
     smooth = [axis for axis in axes if not axis.counts and axis.record != DYNAMICS]
-    with PlacedWorlds(config, smooth, factories) as worlds:
-        folder = study_folder(options.out, "slopes", config.flags.task[0], options.tracker, options.mode)
-        print("\n".join(play_slopes(options, scales, worlds, folder, factories or Factories())))
-    print(f"written: {folder / 'slopes.csv'}, slopes.json, episodes.csv")
+    from arena_newton.eval.play.factories import Factories
+    from arena_newton.eval.studies.adjoint_slopes import play_slopes
+    from arena_newton.eval.studies.placed_play import PlacedWorlds
+    from arena_newton.eval.studies.placement_files import study_folder
+    from arena_newton.eval.studies.placement_page import write_page
+
+    words = "sensitivity", config.flags.task[0], options.tracker, options.mode
+    with PlacedWorlds(config, smooth, factories) as worlds, study_folder(options.out, *words) as folder:
+        lines = play_slopes(options, scales, worlds, folder, factories or Factories())
+        title = f"{config.policy_label} through {options.tracker}: {config.flags.task[0]}, {options.mode}"
+        page = write_page(folder, title)
+    print("\n".join(lines))
+    print(f"written: {page}, slopes.csv, slopes.json, slope_episodes.csv")
     return 0
 
 

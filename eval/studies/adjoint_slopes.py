@@ -18,12 +18,12 @@ from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run import make_env
 from arena_newton.eval.records.journal import write_atomic
 from arena_newton.eval.studies.placed_play import PlacedWorlds
-from arena_newton.eval.studies.placement_files import PlacedStudy, summary_json
+from arena_newton.eval.studies.placement_files import SLOPES, PlacedStudy, summary_json
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.pages.tables import Table, csv_lines
 from arena_newton.tasks.handles import ROBOT
 
-__all__ = ["Slope", "play_slopes", "worth"]
+__all__ = ["KINDS", "Slope", "groups", "play_slopes", "slope_head", "worth"]
 
 FORMAT = 1
 """Version of slopes.json."""
@@ -31,6 +31,19 @@ CHECKPOINT = 25
 """Ticks that the graph keeps the start of."""
 STEP = 1e-2
 """Move of a placement that gives the slope of the start pose in it [m, rad]; what is moved are float32 numbers."""
+NOTHING = 1e-9
+"""Slope and differences below which a number moves nothing [m per unit]: rounding of the margin alone is left."""
+HOLDS, VOID, FIXTURE = "holds", "means nothing at these scales", "no slope: a fixture"
+MULTIPLIED = "chaotic: the episode multiplies the smallest change"
+UNTOUCHED = "no influence: nothing that it moves reaches the margin"
+KINDS = {
+    HOLDS: "slopes that hold",
+    VOID: "void slopes, not to be followed",
+    MULTIPLIED: "void slopes, not to be followed",
+    UNTOUCHED: "no influence",
+    FIXTURE: "no slope, differences alone",
+}
+"""Group of each worth, in the order in which they are told."""
 CHAOTIC = 100.0
 """Change of the margin within the smaller scale above which a motion is chaotic [m]: no scene is so wide."""
 
@@ -45,19 +58,24 @@ class Slope:
     slope: float | None
     """Exact slope of the played actions [m per unit]; None where nothing moves that has one."""
     near: float
-    """Differences of the same actions at the smaller scale; NaN where a world fell."""
+    """Differences of the same actions at the smaller scale; not finite where a world fell."""
     far: float
     """The same at the larger one."""
     grid: float | None
     """Differences at the larger scale in which the policy acts again, at each episode's end; None for a factor."""
     verdict: str
-    """Worth of the slope in words."""
+    """Worth of the slope in words, of `KINDS`."""
+
+    def cells(self) -> tuple[str, ...]:
+        """Its row under `slope_head`."""
+        numbers = map(_text, (self.slope, self.near, self.far, self.grid))
+        return (self.name, f"m/{self.unit}".rstrip("/"), *numbers, self.verdict)
 
 
 def play_slopes(
     options: PlacementOptions, scales: Sequence[float], worlds: PlacedWorlds, folder: Path, factories: Factories
 ) -> list[str]:
-    """Play an episode, differentiate it and compare; writes episodes.csv, slopes.csv and slopes.json.
+    """Play an episode, differentiate it and compare; writes slope_episodes.csv, slopes.csv and slopes.json.
 
     Returns:
         Lines to print.
@@ -70,7 +88,7 @@ def play_slopes(
     drawn = worlds.drawn(seed)
     at = tuple(float(drawn[axis.record][axis.key]) for axis in axes)
     points = [at, *(tuple(_shifted(at, number, side * scales[1])) for number in range(len(at)) for side in (1, -1))]
-    with PlacedStudy(worlds, folder, len(points)) as study:
+    with PlacedStudy(worlds, folder, len(points), SLOPES, method="adjoint", reach=list(scales)) as study:
         played, *others = study.play(points)
     if played.outcome not in ("success", "timeout"):
         raise InputError(
@@ -86,20 +104,31 @@ def play_slopes(
     finally:
         torch.set_num_threads(threads)
         env.close()
-    head = ("number", "unit", "slope", *(f"differences at {scale:g}" for scale in scales), "policy acts again", "worth")
-    cells = [
-        (one.name, f"m/{one.unit}".rstrip("/"), *map(_text, (one.slope, one.near, one.far, one.grid)), one.verdict)
-        for one in found
-    ]
+    head = slope_head(scales)
+    cells = [one.cells() for one in found]
     write_atomic(folder / "slopes.csv", csv_lines([head, *cells]))
-    rows = [{key: value if value == value else None for key, value in vars(one).items()} for one in found]
-    described = [dataclasses.asdict(axis) | {"name": axis.name, "value": v} for axis, v in zip(axes, at, strict=True)]
-    ended = {"outcome": played.outcome, "ticks": played.steps, "policy_has_gradient": answers}
-    write_atomic(folder / "slopes.json", summary_json(FORMAT, options, described, slopes=rows, **ended))
     lines = [f"{played.outcome} after {played.steps} ticks; slopes of the margin then, of what was played"]
     if not answers:
         lines.append("the policy's actions are constants: what it would answer shows in the column `policy acts again`")
+    lines += groups(found)
+    rows = [{key: value if value == value else None for key, value in vars(one).items()} for one in found]
+    described = [dataclasses.asdict(axis) | {"name": axis.name, "value": v} for axis, v in zip(axes, at, strict=True)]
+    ended = {"outcome": played.outcome, "ticks": played.steps, "policy_has_gradient": answers, "summary": lines}
+    write_atomic(folder / "slopes.json", summary_json(FORMAT, options, described, slopes=rows, **ended))
     return [*lines, Table(head, cells).markdown()]
+
+
+def slope_head(scales: Sequence[float]) -> tuple[str, ...]:
+    """Head of the table of slopes."""
+    return ("number", "unit", "slope", *(f"differences at {scale:g}" for scale in scales), "policy acts again", "worth")
+
+
+def groups(slopes: Sequence[Slope]) -> list[str]:
+    """Names of the numbers whose slopes hold, of those whose slopes are void, and of those without influence."""
+    by_kind: dict[str, list[str]] = {}
+    for one in slopes:
+        by_kind.setdefault(KINDS[one.verdict], []).append(one.name)
+    return [f"{kind}: {', '.join(by_kind[kind])}" for kind in dict.fromkeys(KINDS.values()) if kind in by_kind]
 
 
 @dataclass(frozen=True)
@@ -153,20 +182,22 @@ def _slopes(moved: _Moved, ticks: int, scales: Sequence[float], grid: Sequence[f
     names = [(axis.name, axis.unit) for axis in axes] + [(name, "") for name in parameters]
     acted = [*grid, *[None] * len(parameters)]
     return [
-        Slope(name, unit, one, near, far, again, worth(one, holds, scales[0]))
+        Slope(name, unit, one, near, far, again, worth(one, near, far, holds, scales[0]))
         for (name, unit), one, near, far, again, holds in zip(
             names, exact, found.near.tolist(), found.far.tolist(), acted, found.holds.tolist(), strict=True
         )
     ], rolled.answers
 
 
-def worth(slope: float | None, holds: bool, scale: float) -> str:
+def worth(slope: float | None, near: float, far: float, holds: bool, scale: float) -> str:
     """Worth of a slope in words: whether differences hold it, and whether its size within `scale` fits in a scene."""
     if slope is None:
-        return "no slope: a fixture"
+        return FIXTURE
+    if max(abs(slope), abs(near), abs(far)) < NOTHING:
+        return UNTOUCHED
     if not holds and abs(slope) * scale > CHAOTIC:
-        return "chaotic: the episode multiplies the smallest change"
-    return "holds" if holds else "means nothing at these scales"
+        return MULTIPLIED
+    return HOLDS if holds else VOID
 
 
 def _shifted(at: Sequence[float], number: int, change: float) -> list[float]:

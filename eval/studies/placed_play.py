@@ -11,26 +11,17 @@ from dataclasses import dataclass
 
 from arena_newton import rule_sets
 from arena_newton import tasks as task_specs
-from arena_newton.cli.flags import check_least, shared
 from arena_newton.cli.quiet import quiet_warp
-from arena_newton.errors import InputError
-from arena_newton.eval.plan.config import RunConfig, resolve
+from arena_newton.eval.plan.config import RunConfig
 from arena_newton.eval.plan.episode_plan import Episode
-from arena_newton.eval.plan.options import RunOptions
 from arena_newton.eval.play.factories import Factories
 from arena_newton.eval.play.run import check_parts, make_env
-from arena_newton.eval.studies.placement_axes import Axis, axes_of, chosen, moved
-from arena_newton.eval.studies.placement_options import PlacementOptions
+from arena_newton.eval.studies.placement_axes import Axis, moved
 from arena_newton.interfaces import EpisodeResult, Planned, World
 from arena_newton.rollout import Rollout
 from arena_newton.tasks.base import Sample
 
-__all__ = ["MOST_EPISODES", "PlacedEpisode", "PlacedWorlds", "placement_run"]
-
-MOST_EPISODES = 200_000
-"""Episodes of one study, as of one run."""
-MOST_WORLDS = 65_536
-"""Worlds of one batch."""
+__all__ = ["PlacedEpisode", "PlacedWorlds"]
 
 
 @dataclass(frozen=True)
@@ -48,38 +39,6 @@ class PlacedEpisode:
     def episode_seed(self) -> int:
         """Seed of everything that the axes leave open."""
         return self.episode.episode_seed
-
-
-def placement_run(options: PlacementOptions) -> tuple[RunConfig, tuple[Axis, ...]]:
-    """The run behind a study, checked: one task, tracker and mode, and its axes.
-
-    Raises:
-        InputError: A flag is unfit.
-    """
-    if not options.task:
-        raise InputError("--task: name the task whose placements are moved")
-    if options.task == "all":
-        raise InputError("--task all: name one task; each has axes of its own")
-    check_least(options, 0, "seed")
-    check_least(options, 1, "repeats")
-    if not 1 <= options.worlds <= MOST_WORLDS:
-        raise InputError(f"--worlds {options.worlds}: expected 1 to {MOST_WORLDS:,}")
-    config = resolve(
-        shared(
-            options,
-            RunOptions,
-            task=(options.task,),
-            tracker=(options.tracker,),
-            mode=(options.mode,),
-            seeds=(options.seed,),
-            out=None,
-        )
-    )
-    task = config.flags.task[0]
-    axes = axes_of(rule_sets.get(options.rules).task(task), options.mode)
-    if not axes:
-        raise InputError(f"--task {task}: draws no placement in mode {options.mode}")
-    return config, chosen(axes, options.axes, task) if options.axes else axes
 
 
 class PlacedWorlds:

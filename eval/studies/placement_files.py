@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import dataclasses
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TextIO
 
 from arena_newton.cli.intervals import wilson
 from arena_newton.errors import InputError
+from arena_newton.eval.folders.run_folder import setting
 from arena_newton.eval.plan.episode_plan import Episode
+from arena_newton.eval.records.identity import differing_key
 from arena_newton.eval.records.journal import StorageError, write_atomic
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.studies.placed_play import PlacedEpisode, PlacedWorlds
 from arena_newton.eval.studies.placement_axes import Axis
 from arena_newton.eval.studies.placement_options import PlacementOptions
+from arena_newton.files.new_folder import held_folder
+from arena_newton.files.stored_json import Json, JsonObject, read_object
 from arena_newton.interfaces import EpisodeResult
 from arena_newton.pages.tables import csv_lines
 from arena_newton.robot.g1 import TICK
 
-__all__ = ["PlacedStudy", "PointTally", "point_rows", "rate_text", "study_folder", "summary_json", "tallies"]
+__all__ = ["SLOPES", "PlacedStudy", "PointTally", "point_rows", "rate_text", "study_folder", "summary_json", "tallies"]
 
-EPISODES = "episodes.csv"
-"""Name of the file with one row per episode."""
+EPISODES, SLOPES = "episodes", "slope_episodes"
+"""Names, without their endings, of the files with one row per episode: of a grid or a search, and of slopes."""
 
 
 @dataclass(frozen=True)
@@ -92,47 +98,73 @@ def _tally(results: Sequence[EpisodeResult]) -> PointTally:
     )
 
 
-def study_folder(out: str | None, *words: str) -> Path:
-    """A new folder for a study.
+@contextlib.contextmanager
+def study_folder(out: str | None, *words: str) -> Iterator[Path]:
+    """The folder of a study, made or gone on with, and kept from other processes while the block lasts.
 
     Args:
         out: What --out says.
         *words: What its usual name below `results` is made of.
 
     Raises:
-        InputError: It exists.
-        StorageError: It cannot be made.
+        InputError: It holds something else, another process writes it, or it cannot be made.
     """
     usual = Path("results") / "_".join(re.sub(r"[^\w.-]+", "-", word) for word in words)
     folder = Path(out).expanduser() if out is not None else usual
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise InputError(f"--out {folder}: exists; name another folder") from None
-    except OSError as error:
-        raise StorageError(f"--out {folder}: cannot be made ({error.strerror})") from None
-    return folder
+    if folder.exists() and not any((folder / f"{name}.json").is_file() for name in (EPISODES, SLOPES)):
+        raise InputError(f"--out {folder}: exists and holds no study of placements; name another folder")
+    with held_folder(folder, "plays a study in it"):
+        yield folder
 
 
 class _PlacedRows:
-    """`episodes.csv`: a row is on the disk as soon as its episode has ended; `close` puts them in the plan's order."""
+    """A file with a row per episode, on the disk as soon as it has ended; `close` puts them in the plan's order.
 
-    def __init__(self, folder: Path, axes: Sequence[Axis]):
-        """Begin the file."""
-        self._path, self._axes = folder / EPISODES, tuple(axes)
+    A JSON file next to it says of which run and study they are; rows of the same one are not played again.
+    """
+
+    def __init__(self, folder: Path, name: str, worlds: PlacedWorlds, study: JsonObject):
+        """Begin the file, or read what an interrupted study left in it.
+
+        Raises:
+            InputError: The folder holds another run or study.
+        """
+        self._path, self._axes = folder / f"{name}.csv", worlds.axes
         self._results: list[EpisodeResult] = []
+        self._kept: dict[tuple[str, ...], list[str]] = {}
         self._file: TextIO | None = None
+        axes = [axis.name for axis in worlds.axes]
+        facts = json.loads(json.dumps({"run": worlds.config.identity(), "study": {**study, "axes": axes}}))
+        for one in (EPISODES, SLOPES):
+            _check_same(folder / f"{one}.json", facts, other=one != name)
+        if self._path.exists():
+            self._read()
+        else:
+            write_atomic(self._path.with_suffix(".json"), json.dumps(facts, indent=2) + "\n")
+        write_atomic(self._path, csv_lines([self._head(), *self._kept.values()]))
         try:
-            self._file = self._path.open("x", encoding="utf-8", newline="")
+            self._file = self._path.open("a", encoding="utf-8", newline="")
         except OSError as error:
             raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
-        self._put(self._file, [self._head()])
+
+    def known(self, placed: PlacedEpisode) -> EpisodeResult | None:
+        """Result of an episode that an interrupted study played."""
+        row = self._kept.pop(self._key(placed), None)
+        if row is None:
+            return None
+        outcome, reason, steps, margin = row[-4:]
+        self._results.append(EpisodeResult(placed, outcome, reason, int(steps), float(margin)))
+        return self._results[-1]
 
     def add(self, result: EpisodeResult) -> None:
         """Write an episode's row."""
         self._results.append(result)
         if self._file is not None:
-            self._put(self._file, [self._row(result)])
+            try:
+                self._file.write(csv_lines([self._row(result)]))
+                self._file.flush()
+            except OSError as error:
+                raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
 
     def close(self) -> None:
         """Write all rows again, in the order of placements and seeds: the same bytes for any number of worlds."""
@@ -140,35 +172,66 @@ class _PlacedRows:
             self._file.close()
             self._file = None
         ordered = sorted(self._results, key=lambda one: (one.episode.point, one.episode.episode.index))
-        write_atomic(self._path, csv_lines([self._head(), *map(self._row, ordered)]))
+        write_atomic(self._path, csv_lines([self._head(), *map(self._row, ordered), *self._kept.values()]))
 
-    def _put(self, file: TextIO, rows: Sequence[Sequence[object]]) -> None:
-        try:
-            file.write(csv_lines(rows))
-            file.flush()
-        except OSError as error:
-            raise StorageError(f"{self._path}: cannot be written ({error.strerror})") from None
+    def _read(self) -> None:
+        """Rows of an interrupted study but for one that was not written whole; errors are played again."""
+        whole, _, _ = self._path.read_text(encoding="utf-8").rpartition("\n")
+        head, *rows = csv.reader(whole.splitlines())
+        if head != self._head() or any(len(row) != len(head) for row in rows):
+            raise InputError(f"{self._path}: is not what a study of placements wrote; name another folder")
+        self._kept = {tuple(row[:-4]): row for row in rows if row[-4] != "error"}
 
     def _head(self) -> list[str]:
         names = [axis.name for axis in self._axes]
         return ["point", *names, "repeat", "episode_seed", "outcome", "reason", "steps", "margin"]
 
+    def _key(self, placed: PlacedEpisode) -> tuple[str, ...]:
+        values = map(_number, placed.values)
+        return (str(placed.point), *values, str(placed.episode.repeat), str(placed.episode_seed))
+
     def _row(self, result: EpisodeResult) -> list[object]:
-        placed: PlacedEpisode = result.episode
-        columns = (result.outcome, result.reason, result.steps, f"{result.margin:.6g}")
-        return [placed.point, *map(_number, placed.values), placed.episode.repeat, placed.episode_seed, *columns]
+        return [*self._key(result.episode), result.outcome, result.reason, result.steps, repr(float(result.margin))]
+
+
+def _check_same(path: Path, wanted: JsonObject, *, other: bool) -> None:
+    """Refuse a folder whose episodes are of another run, or of another study; of the `other` file the run counts alone.
+
+    A grid has several seeds at each placement, slopes have one.
+    """
+    if not path.exists():
+        return
+    stored = read_object(path, 1 << 20)
+    found = differing_key(stored.get("run") or {}, wanted["run"], ("repeats",) if other else ())
+    if found is None and not other:
+        found = differing_key(stored.get("study") or {}, wanted["study"])
+    if found is not None:
+        key, was, now = found
+        raise InputError(
+            f"--out {path.parent}: holds episodes of another study: {key} was {setting(was)}, now {setting(now)}; "
+            "name another folder"
+        )
 
 
 class PlacedStudy:
     """Plays placements and keeps what came of them; a context that puts the rows in order."""
 
-    def __init__(self, worlds: PlacedWorlds, folder: Path, count: int):
-        """Begin a study of so many episodes in a new folder."""
+    def __init__(self, worlds: PlacedWorlds, folder: Path, count: int, name: str = EPISODES, **study: Json):
+        """Begin a study of so many episodes in a folder, or go on with it.
+
+        Args:
+            worlds: Where they are played.
+            folder: That of `study_folder`.
+            count: Episodes.
+            name: Name of the file of rows, without its ending.
+            study: What makes it another study, besides its run and its axes.
+        """
         flags = worlds.config.flags
         self.results: list[EpisodeResult] = []
         self.budget = worlds.config.episodes[0].max_steps
         """Step budget of an episode [ticks]."""
-        self._worlds, self._rows, self._points = worlds, _PlacedRows(folder, worlds.axes), 0
+        self._worlds, self._points = worlds, 0
+        self._rows = _PlacedRows(folder, name, worlds, study)
         self._progress = Progress(self.budget * count, planned=count)
         self._progress.group(f"{flags.task[0]} {flags.tracker[0]} {flags.mode[0]}")
 
@@ -178,7 +241,13 @@ class PlacedStudy:
         """Results of placements, in their order."""
         placed = self._worlds.placed(points, self._points, episodes)
         self._points += len(points)
-        results = self._worlds.play(placed, self._ended, self._progress.tick)
+        found = {one: self._rows.known(one) for one in placed}
+        left = [one for one, result in found.items() if result is None]
+        for _ in range(len(placed) - len(left)):
+            self._progress.episode(self.budget, 0)
+        if left:
+            found |= dict(zip(left, self._worlds.play(left, self._ended, self._progress.tick), strict=True))
+        results = [result for result in found.values() if result is not None]
         self.results += results
         return results
 

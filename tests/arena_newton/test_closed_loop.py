@@ -236,6 +236,18 @@ def test_reach_tells_a_slope_that_holds_from_one_that_does_not():
     assert abs(found.far[1] - 1.0) < 0.3 and found.holds.tolist() == [True, False]
 
 
+def test_a_slope_next_to_a_fall_does_not_hold():
+    """Where a world falls within a scale, to one side or to both, differences are not finite, and nothing holds."""
+
+    def falls(points):
+        return points.masked_fill(points > 0.5, -torch.inf)[:, 0]
+
+    at, slope = torch.zeros(1).double(), torch.ones(1).double()
+    assert reach(falls, at, slope, (0.1, 0.4), rows=3).holds.all()
+    assert not reach(falls, at, slope, (0.1, 1.0), rows=3).holds.any()
+    assert not reach(falls, at + 3.0, slope, (0.1, 1.0), rows=3).holds.any()
+
+
 def test_a_planning_model_is_no_engine():
     """A contact that begins smoothly is another world: it names itself, plays no episode and refuses unfit prims."""
     env = worlds("football", "pd")

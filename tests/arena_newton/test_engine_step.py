@@ -213,6 +213,7 @@ DRIVE = "<actuator><position joint='j'/></actuator>"
 IMPLICIT = "<option integrator='implicitfast'/>"
 TENDON = "<tendon><fixed><joint joint='j' coef='1'/></fixed></tendon>"
 MOTOR = "<actuator><motor joint='j'/></actuator>"
+SPEED = "<actuator><velocity joint='j' kv='2'/></actuator>"
 SLOW = "<actuator><position joint='j' timeconst='.1'/></actuator>"
 ROUND = "<option integrator='implicitfast' cone='elliptic'/>"
 AIR = "<option integrator='implicitfast' density='1.2'/>"
@@ -224,6 +225,7 @@ AIR = "<option integrator='implicitfast' density='1.2'/>"
         (JOINT + DRIVE, "an integrator other than implicitfast"),
         (IMPLICIT + JOINT + DRIVE + TENDON, "a tendon"),
         (IMPLICIT + JOINT + MOTOR, "actuator 0, not a joint's position drive"),
+        (IMPLICIT + JOINT + DRIVE.replace("</actuator>", "") + SPEED[10:], "actuator 1, not a joint's position drive"),
         (IMPLICIT + JOINT + SLOW, "an activation state"),
         (AIR + JOINT + DRIVE, "a fluid"),
         (ROUND + JOINT + DRIVE, "elliptic friction cones"),

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from eval_fakes import PlacedEnv, factories
 from arena_newton import rule_sets, tasks
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.studies.adjoint_slopes import worth
+from arena_newton.eval.studies.adjoint_slopes import KINDS, Slope, groups, worth
 from arena_newton.eval.studies.placement_axes import axes_of, chosen, moved
 from arena_newton.interfaces import Verdict
 from arena_newton.kernels import tick as codes
@@ -107,19 +110,36 @@ def test_files_do_not_depend_on_the_number_of_worlds(tmp_path):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "7" / name).read_bytes(), name
 
 
-def test_what_was_played_is_kept(tmp_path, monkeypatch):
-    """An interruption leaves the rows of all episodes that had ended."""
-    plain, ended = HalfEnv.step, []
+def test_an_interrupted_grid_goes_on(tmp_path, monkeypatch, capsys):
+    """The same command plays what an interruption left: the same bytes, but for an episode with an error none twice."""
+    flags = ("--grid", "3", "--worlds", "2", "--max-steps", "4")
+    assert call(tmp_path / "whole", *flags) == 0
+    plain = HalfEnv.step
 
     def stopped(self, action, worlds=None):
         if len(self.played) > 6:
             raise KeyboardInterrupt
-        ended.append(1)
         return plain(self, action, worlds)
 
     monkeypatch.setattr(HalfEnv, "step", stopped)
-    assert call(tmp_path / "out", "--grid", "3", "--worlds", "2", "--max-steps", "4") == 130
-    assert len(rows(tmp_path / "out" / "episodes.csv")) in (5, 6)
+    assert call(tmp_path / "out", *flags) == 130
+    monkeypatch.setattr(HalfEnv, "step", plain)
+    path = tmp_path / "out" / "episodes.csv"
+    left = path.read_text().splitlines()
+    assert len(left) in (6, 7)
+    broken = [line.replace(line.split(",")[-4], "error") for line in left[1:2]]
+    path.write_text("\n".join([left[0], *broken, *left[2:]]) + "\n3,0.1")  # an error, and a line that a kill cut
+    assert call(tmp_path / "out", *flags) == 0 and len(HalfEnv.played) == 9 - len(left[2:])
+    for file in (tmp_path / "whole").iterdir():
+        assert (tmp_path / "out" / file.name).read_bytes() == file.read_bytes(), file.name
+    assert call(tmp_path / "out", *flags) == 0 and not HalfEnv.played
+    capsys.readouterr()
+    for other, words in ((("--grid", "2"), "grid was"), (("--seed", "1"), "seeds was 0, now 1")):
+        assert call(tmp_path / "out", *flags, *other) == 2
+        assert f"holds episodes of another study: {words}" in capsys.readouterr().err and not HalfEnv.played
+    path.write_text("point\n")
+    assert call(tmp_path / "out", *flags) == 2
+    assert "episodes.csv: is not what a study of placements wrote" in capsys.readouterr().err
 
 
 def test_one_axis_is_a_map_of_one_row(tmp_path):
@@ -155,11 +175,19 @@ def test_unfit_flags_are_one_line(tmp_path, capsys, flags, message):
     assert not (tmp_path / "out").exists() and not HalfEnv.played
 
 
-def test_a_folder_is_never_written_twice(tmp_path, capsys):
-    """An existing folder is refused, whatever is in it."""
+def test_a_folder_of_something_else_is_refused(tmp_path, capsys):
+    """An existing folder without a study is left alone, whatever is in it."""
     (tmp_path / "out").mkdir()
     assert call(tmp_path / "out", "--grid", "2") == 2
-    assert "exists; name another folder" in capsys.readouterr().err
+    assert "exists and holds no study of placements; name another folder" in capsys.readouterr().err
+
+
+def test_axes_are_refused_before_torch_is_loaded():
+    """A wrong axis or scale costs no library of physics."""
+    code = "import sys\nfrom arena_newton.eval.__main__ import main\nprint(main(sys.argv[1:]), 'torch' in sys.modules)"
+    for flags in ("--axes ball.x", "--method adjoint --axes ball.x", "--method adjoint --reach 2 1"):
+        command = [sys.executable, "-c", code, "sensitivity", "--task", "football", *flags.split()]
+        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "2 False", flags
 
 
 def test_samples_place_what_the_seed_would(tmp_path):
@@ -196,15 +224,33 @@ def test_slopes_of_an_episode(tmp_path, capsys, request):
     told = json.loads((tmp_path / "out" / "slopes.json").read_text())
     assert (told["outcome"], told["ticks"], told["policy_has_gradient"]) == ("timeout", 2, False)
     assert "actions are constants" in capsys.readouterr().out
+    words = "<li>slopes that hold: football.y</li>\n<li>no influence: football.x, "
+    page = (tmp_path / "out" / "sensitivity.html").read_text()
+    assert words in page and 'badge pass">holds' in page and "sensitivity.png" not in page
+    assert main(["sensitivity", *flags.split(), "--grid", "1", "--out", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "sensitivity.html").read_text()
+    assert words in page and "sensitivity.png" in page and "success over 1 placement" in page
+    assert main(["sensitivity", *flags.split(), "--seed", "1", "--grid", "1", "--out", str(tmp_path / "out")]) == 2
+    assert "seeds was 0, now 1" in capsys.readouterr().err
 
 
 def test_worth_of_a_slope_in_words():
-    """A slope that would lead out of every scene within the smaller scale is called chaotic, by its size alone."""
-    assert worth(None, False, 0.001) == "no slope: a fixture"
-    assert worth(-17.0, True, 0.001) == "holds"
-    assert worth(-17.0, False, 0.001) == "means nothing at these scales"
-    assert worth(-5.99e12, False, 0.001).startswith("chaotic: ")
-    assert worth(5.99e12, False, 1e-15) == "means nothing at these scales"
+    """Void slopes and numbers without influence are named; one that would lead out of every scene is chaotic."""
+    assert worth(None, 0.1, 0.1, False, 0.001) == "no slope: a fixture"
+    assert worth(-17.0, -17.0, -17.0, True, 0.001) == "holds"
+    assert worth(-17.0, 2.0, 2.0, False, 0.001) == "means nothing at these scales"
+    assert worth(0.0, 2.0, 2.0, False, 0.001) == "means nothing at these scales"
+    assert worth(0.0, 0.0, 0.0, True, 0.001).startswith("no influence: ")
+    assert worth(0.0, -math.inf, 0.0, False, 0.001) == "means nothing at these scales"
+    assert worth(-5.99e12, 1.0, 1.0, False, 0.001).startswith("chaotic: ")
+    assert worth(5.99e12, 1.0, 1.0, False, 1e-15) == "means nothing at these scales"
+    slopes = [Slope(name, "m", 1.0, 1.0, 1.0, None, text) for name, text in zip("abcde", KINDS, strict=True)]
+    assert groups(slopes) == [
+        "slopes that hold: a",
+        "void slopes, not to be followed: b, c",
+        "no influence: d",
+        "no slope, differences alone: e",
+    ]
 
 
 def test_unfit_flags_of_slopes(capsys):
