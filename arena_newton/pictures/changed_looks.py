@@ -21,9 +21,10 @@ import torch
 
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
+from arena_newton.tasks.base import KEY_OBJECT
 
 __all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "goal_colour", "hue_lacks", "luminance", "palette"]
-__all__ += ["recoloured", "seen_colours", "unlike"]
+__all__ += ["recoloured", "seen_colours", "shape_sums", "unlike"]
 
 SEMANTIC_COLOURS = (
     (0.05, 0.85, 0.1),  # the cube on the bag
@@ -96,7 +97,14 @@ class Changes:
     exposure: float = 0.8
     """Gain, gamma, cast, a smooth field, noise."""
     key_objects: float = 0.15
-    """New colours of shapes that a hand must find (`TaskSpec.recolour` between 0 and 1)."""
+    """New colours of shapes that a hand must find (`TaskSpec.recolour` is `KEY_OBJECT`)."""
+    goals: float = 0.0
+    """New colours of what the task is about, where its form tells it apart (`TaskSpec.recolour` is `GOAL_OBJECT`)."""
+
+    def chances(self, own: torch.Tensor) -> torch.Tensor:
+        """Probability of another colour of shapes whose films say `own`."""
+        goal, key = (own > 0.0) & (own < KEY_OBJECT), (own >= KEY_OBJECT) & (own < 1.0)
+        return own + goal * (self.goals - own) + key * (self.key_objects - own)
 
 
 USUAL = Changes()
@@ -173,8 +181,9 @@ def changed_looks(
     colours: torch.Tensor,
     task: torch.Tensor,
     changes: Changes = USUAL,
+    changed: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Change the look of every sample of a batch, each in its own way.
+    """Change the look of samples of a batch, each in its own way.
 
     Args:
         seen: Pictures, uint8, shape [B, H, W, 3].
@@ -185,6 +194,7 @@ def changed_looks(
         colours: Colours that may be drawn, as of `unlike`, int64, shape [B, 4096].
         task: Number of each sample's task, int64, shape [B]; things are cut out of another task's pictures.
         changes: Probabilities.
+        changed: Samples that change, bool, shape [B]; None: all.
 
     Returns:
         0 to 1, float32, shape [B, H, W, 3].
@@ -192,28 +202,33 @@ def changed_looks(
     batch, height, width = seen.shape[:3]
     device = seen.device
     shapes = frames[..., 0].reshape(batch, -1).long()
-    free = chances.gather(1, shapes) >= 1.0
-    chance = chances + ((chances > 0.0) & (chances < 1.0)) * (changes.key_objects - chances)
-    luma = luminance(seen).reshape(batch, -1)
-    pixels = seen.reshape(batch, -1, 3).float() / 255.0
-    pixels = recoloured(pixels, luma, shapes, objects, chance, colours, (height, width), changes)
-    things = objects.gather(1, shapes), (chance > 0.0).gather(1, shapes)
-    pixels = _with_things(pixels, luma, things, free, colours, task, (height, width), changes.things)
+    chance, free = changes.chances(chances), (chances >= 1.0).gather(1, shapes)
+    pixels = seen.reshape(batch, -1, 3).float()
+    luma = luminance(pixels)
+    original = pixels = pixels.div_(255.0)
+    sums = shape_sums(luma, shapes)
+    pixels = recoloured(pixels, luma, shapes, sums, chance, objects, colours, (height, width), changes)
+    things = objects, chance > 0.0
+    pixels = _with_things(pixels, luma, shapes, sums, things, free, colours, task, (height, width), changes.things)
     inside = free & _rectangles(batch, height, width, device) & _happens(batch, changes.rectangles, device)
     pixels = torch.where(inside[..., None], _colours(1, colours), pixels)
-    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., -1]).float()
-    ratio = torch.exp2((lit.reshape(batch, -1) - 128.0) / 32.0)
+    lit = torch.where(torch.rand((batch, 1, 1), device=device) < 0.5, frames[..., 1], frames[..., -1])
     weight = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.light, device)
-    pixels = pixels * (1.0 + weight * (ratio - 1.0))[..., None]
-    return _exposed(pixels.clamp_(0.0, 1.0).view(batch, height, width, 3), changes.exposure)
+    gains = 1.0 + weight * (torch.exp2((torch.arange(256.0, device=device) - 128.0) / 32.0) - 1.0)
+    pixels = pixels * gains.gather(1, lit.reshape(batch, -1).long())[..., None]
+    pixels = _exposed(pixels.clamp_(0.0, 1.0).view(batch, height, width, 3), changes.exposure)
+    if changed is None:
+        return pixels
+    return torch.where(changed[:, None, None, None], pixels, original.view_as(pixels))
 
 
 def recoloured(
     pixels: torch.Tensor,
     luma: torch.Tensor,
     shapes: torch.Tensor,
-    objects: torch.Tensor,
+    sums: torch.Tensor,
     chance: torch.Tensor,
+    objects: torch.Tensor,
     colours: torch.Tensor,
     size: tuple[int, int],
     changes: Changes,
@@ -224,8 +239,9 @@ def recoloured(
         pixels: 0 to 1, shape [B, P, 3].
         luma: Luminance of each pixel, 0 to 255, int64, shape [B, P].
         shapes: Shape of each pixel, int64, shape [B, P].
-        objects: Object of each shape, int64, shape [B, 256].
+        sums: Luminance and number of the pixels of each shape, int64, shape [2, B, 256].
         chance: Probability of another colour of each shape, shape [B, 256].
+        objects: First shape of the object that each shape is part of, int64, shape [B, 256].
         colours: As in `changed_looks`.
         size: Height and width, whose product is P.
         changes: Probabilities.
@@ -234,14 +250,15 @@ def recoloured(
         Pixels of the same shape.
     """
     batch, device = len(pixels), pixels.device
-    parts = torch.where(torch.rand((batch, 1), device=device) < 0.5, objects, torch.arange(SHAPES, device=device))
+    part = torch.where(torch.rand((batch, 1), device=device) < 0.5, objects, torch.arange(SHAPES, device=device))
     rate = torch.rand((batch, 1), device=device).mul_(0.7).add_(0.3) * _happens(batch, changes.colours, device)
-    mine = torch.rand((batch, SHAPES), device=device).gather(1, parts) < rate * chance
-    part = parts.gather(1, shapes)
-    which = 3 * part + _pattern(part, size, changes.patterns)
-    chosen = _colours(3 * SHAPES, colours).take_along_dim(which[..., None], 1)
-    shade = _shade(luma, part)[..., None]
-    return torch.where(mine.gather(1, shapes)[..., None], (chosen * shade).clamp_(0.0, 1.0), pixels)
+    mine = torch.rand((batch, SHAPES), device=device).gather(1, part) < rate * chance
+    which = _pattern(part, shapes, size, changes.patterns)
+    three = _colours(3 * SHAPES, colours).view(batch, SHAPES, 9).take_along_dim(part[..., None], 1)
+    chosen = three.view(batch, -1, 3).take_along_dim((3 * shapes + which)[..., None], 1)
+    light, count = torch.zeros_like(sums).scatter_add_(2, part.expand_as(sums), sums).gather(2, part.expand_as(sums))
+    shade = _over(luma, (light / count.clamp_min(1)).gather(1, shapes))[..., None]
+    return torch.where(mine.gather(1, shapes)[..., None], chosen.mul_(shade).clamp_(0.0, 1.0), pixels)
 
 
 @functools.cache
@@ -250,24 +267,23 @@ def _weights(device: torch.device) -> torch.Tensor:
 
 
 def luminance(seen: torch.Tensor) -> torch.Tensor:
-    """Luma in whole numbers, 0 to 255, int64, of uint8 pictures [..., 3].
+    """Luma in whole numbers, 0 to 255, int64, of pictures of the values 0 to 255 [..., 3].
 
     Exact in single precision, so the same on every device; and sums of it do not depend on their order.
     """
     return (seen.float() @ _weights(seen.device)).div_(256.0).long()
 
 
-def _shade(luma: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
-    """Luminance of each pixel over the mean of its part, shape [B, P]."""
-    sums = torch.zeros((len(luma), SHAPES), dtype=torch.int64, device=luma.device)
-    counts = torch.zeros_like(sums).scatter_add_(1, part, torch.ones_like(part))
-    mean = sums.scatter_add_(1, part, luma) / counts.clamp_min(1)
-    return _over(luma, mean.gather(1, part))
+def shape_sums(luma: torch.Tensor, shapes: torch.Tensor) -> torch.Tensor:
+    """Sum of the luminance of each shape's pixels, and their number, int64, shape [2, B, 256]; one pass for both."""
+    both = torch.zeros((len(luma), SHAPES), dtype=torch.int64, device=luma.device)
+    both.scatter_add_(1, shapes, luma + (1 << 32))
+    return torch.stack([both & ((1 << 32) - 1), both >> 32])
 
 
 def _over(luma: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
     """Luminance over a mean, bounded in both directions so that neither noise nor a highlight becomes a colour."""
-    return ((luma + 6.0) / (mean + 6.0)).clamp_(0.0, 2.5)
+    return (luma + 6.0).div_(mean + 6.0).clamp_(0.0, 2.5)
 
 
 def _happens(batch: int, probability: float, device: torch.device) -> torch.Tensor:
@@ -281,11 +297,17 @@ def _colours(count: int, colours: torch.Tensor) -> torch.Tensor:
     return palette(device)[colours.gather(1, torch.randint(0, COLOURS, (len(colours), count), device=device))]
 
 
-def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> torch.Tensor:
+def _pattern(part: torch.Tensor, shapes: torch.Tensor, size: tuple[int, int], probability: float) -> torch.Tensor:
     """Index of the three colours of its part at each pixel: one, blotches, stripes, tiles or bricks, in perspective.
 
+    Args:
+        part: Part of each shape, int64, shape [B, 256].
+        shapes: Shape of each pixel, int64, shape [B, P].
+        size: Height and width, whose product is P.
+        probability: Of a pattern instead of one colour.
+
     Returns:
-        0, 1 or 2, int64, shape [B, P].
+        0, 1 or 2, uint8, shape [B, P].
     """
     (height, width), batch, device = size, len(part), part.device
     uniform = torch.rand((8, batch, 1, 1), device=device)
@@ -298,38 +320,43 @@ def _pattern(part: torch.Tensor, size: tuple[int, int], probability: float) -> t
     floor = torch.cos(turn) * across - torch.sin(turn) * away, torch.sin(turn) * across + torch.cos(turn) * away
     near = 1.0 / (1.0 + 1.4 * (uniform[3] - 0.5) * x)
     wall = 2.0 * x * near, 2.0 * (y + 0.2 * (uniform[4] - 0.5)) * near
-    draws = torch.rand((5, batch, SHAPES), device=device)
-    lies, scale, kind, line, mixed = (draw.gather(1, part) for draw in draws)
+    draws = torch.rand((5, batch, SHAPES), device=device).gather(2, part.expand(5, -1, -1))
+    lies, scale, kind, line, mixed = draws
     scale = 0.6 * torch.exp2(3.0 * scale)
-    u, v = (
-        torch.where(lies < 0.5, one.reshape(batch, -1), other.expand(-1, height, width).reshape(batch, -1)) * scale
-        for one, other in zip(floor, wall, strict=True)
-    )
     kind = (kind / max(probability, 1e-6) * 4.0).long()  # 4 and more: one colour
-    row = torch.floor(2.0 * v)
-    u = torch.where(kind == 3, u + 0.5 * torch.remainder(row, 2.0), u)
-    v = torch.where(kind == 3, 2.0 * v, v)
+    bricks = kind == 3
     line = 0.03 + 0.12 * line
-    joints = (torch.remainder(u, 1.0) < line) | (torch.remainder(v, 1.0) < line)
-    cell = torch.floor(u) * 12.9898 + torch.floor(v) * 78.233 + 100.0 * uniform[5].view(-1, 1)
-    speckled = torch.remainder(torch.sin(cell) * 4375.85, 1.0) < 0.6 * mixed
-    stripes = torch.remainder(u, 1.0)
+    # Bounds of each shape, beyond which no pixel is where its pattern has no such part.
+    blotches, stripes, tiles = kind == 0, kind == 1, (kind == 2) | bricks
+    bounds = [scale, scale * (1 + bricks.int()), 0.5 * bricks, 3.0 * line * stripes + line * tiles, line * tiles]
+    bounds += [1.0 - 0.4 * mixed + 2.0 * ~stripes, 0.6 * mixed * tiles]
+    scale_u, scale_v, offset, wide, high, last, speckled = (
+        torch.stack(bounds).gather(2, shapes.expand(len(bounds), -1, -1)).unbind()
+    )
+    lying, blotched = torch.stack([lies < 0.5, blotches]).gather(2, shapes.expand(2, -1, -1)).unbind()
+    u, v = (
+        torch.where(lying, one.reshape(batch, -1), other.expand(-1, height, width).reshape(batch, -1)) * scale
+        for one, other, scale in zip(floor, wall, (scale_u, scale_v), strict=True)
+    )
+    row = torch.floor(v)
+    u = u + offset * torch.remainder(row, 2.0)
+    along = torch.remainder(u, 1.0)
+    cell = torch.floor(u) * 12.9898 + row * 78.233 + 100.0 * uniform[5].view(-1, 1)
     # Blotches: a random field of the sample, seen in the same perspective.
     field = torch.rand((batch, 2, 24, 24), device=device)
-    where = torch.stack([torch.remainder(u / 4.0, 2.0), torch.remainder(v / 4.0, 2.0)], dim=-1) - 1.0
+    where = torch.stack([torch.remainder(u / 4.0, 2.0), torch.remainder(v / 4.0, 2.0)], dim=-1).sub_(1.0)
     cloud = torch.nn.functional.grid_sample(field, where[:, None], padding_mode="border", align_corners=True)[:, :, 0]
-    first = torch.stack([cloud[:, 0] > 0.55, stripes < 3.0 * line, joints])
-    second = torch.stack([cloud[:, 1] > 0.6, stripes > 1.0 - 0.4 * mixed, ~joints & speckled])
-    second[0] &= first[0]
-    second[1] &= ~first[1]
-    which = first.long() * ~second + 2 * second.long()
-    chosen: torch.Tensor = which.gather(0, kind.clamp_max(2)[None])[0] * (kind <= 3)
-    return chosen
+    first = (cloud[:, 0] > 0.55) & blotched | (along < wide) | (torch.remainder(v, 1.0) < high)
+    second = (along > last) | (torch.remainder(torch.sin(cell) * 4375.85, 1.0) < speckled)
+    inner, outer = (cloud[:, 1] > 0.6) & blotched & first, second & ~first
+    return first.byte().add_(inner).add_(outer, alpha=2)
 
 
 def _with_things(
     pixels: torch.Tensor,
     luma: torch.Tensor,
+    shapes: torch.Tensor,
+    sums: torch.Tensor,
     things: tuple[torch.Tensor, torch.Tensor],
     free: torch.Tensor,
     colours: torch.Tensor,
@@ -340,25 +367,26 @@ def _with_things(
     """Put something out of another sample's picture somewhere, in another colour, behind what must stay visible.
 
     Args:
-        things: Of each pixel: its object, and whether that may get another colour; both of shape [B, P].
+        things: Of each shape: its object, and whether that may get another colour; both of shape [B, 256].
     """
     (height, width), (batch, count), device = size, luma.shape, luma.device
     other = torch.randint(0, batch, (batch,), device=device)
     at = torch.randint(0, count, (batch, 1), device=device)
-    theirs, movable, bright = things[0][other], things[1][other], luma[other]
-    thing = (theirs == theirs.gather(1, at)) & movable
-    area = thing.float().mean(dim=1, keepdim=True)
-    fits = (area > 0.001) & (area < 0.15) & (task[other] != task)[:, None] & _happens(batch, probability, device)
-    mean = (bright * thing).sum(dim=1, keepdim=True) / thing.sum(dim=1, keepdim=True).clamp_min(1)
-    shade = _over(bright, mean)
+    first = other[:, None] * count  # pixel of all samples
+    theirs, movable = (one[other] for one in things)
+    thing = (theirs == theirs.gather(1, shapes.view(-1)[first + at])) & movable
+    light, area = (sums[:, other] * thing).sum(dim=2, keepdim=True)
+    fits = (area > 0.001 * count) & (area < 0.15 * count) & (task[other] != task)[:, None]
+    fits &= _happens(batch, probability, device)
     moved = torch.rand((2, batch, 1), device=device) - 0.5
     down = torch.arange(height, device=device) + (0.6 * height * moved[0]).long()
     right = torch.arange(width, device=device) + (0.9 * width * moved[1]).long()
     within = ((down >= 0) & (down < height))[:, :, None] & ((right >= 0) & (right < width))[:, None, :]
-    source = down.clamp(0, height - 1)[:, :, None] * width + right.clamp(0, width - 1)[:, None, :]
+    source = (first + down.clamp(0, height - 1) * width)[:, :, None] + right.clamp(0, width - 1)[:, None, :]
     source = source.reshape(batch, -1)
-    put = thing.gather(1, source) & within.reshape(batch, -1) & free & fits
-    colour = _colours(1, colours) * shade.gather(1, source)[..., None]
+    put = thing.gather(1, shapes.view(-1)[source]) & within.reshape(batch, -1) & free & fits
+    shade = _over(luma.view(-1)[source], light / area.clamp_min(1))
+    colour = _colours(1, colours) * shade[..., None]
     return torch.where(put[..., None], colour.clamp_(0.0, 1.0), pixels)
 
 
@@ -386,7 +414,7 @@ def _exposed(pictures: torch.Tensor, probability: float) -> torch.Tensor:
         drawn(0.75, 1.25, 1, 3, 4), size=(height, width), mode="bilinear", align_corners=True
     )
     gain = drawn(0.65, 1.35, 1, 1, 1) * drawn(0.88, 1.12, 1, 1, 3)
-    pictures = (pictures * gain * field.permute(0, 2, 3, 1)).clamp_(0.0, 1.0)
-    pictures = pictures.clamp_min(1e-4) ** drawn(0.7, 1.4, 1, 1, 1)
-    noise = torch.randn(pictures.shape, device=device) * (drawn(1.0, 1.03, 1, 1, 1) - 1.0)
-    return (pictures + noise).clamp_(0.0, 1.0)
+    pictures = (pictures * gain).mul_(field.permute(0, 2, 3, 1)).clamp_(1e-4, 1.0)
+    pictures = pictures.pow_(drawn(0.7, 1.4, 1, 1, 1))
+    noise = torch.randn(pictures.shape, device=device).mul_(drawn(1.0, 1.03, 1, 1, 1) - 1.0)
+    return noise.add_(pictures).clamp_(0.0, 1.0)

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DISTANT_LIGHT",
+    "GOAL_OBJECT",
+    "KEY_OBJECT",
     "LIFT",
     "REACH",
     "ROOM",
@@ -88,6 +90,8 @@ REACH = 0.8
 """Distance of the root [m] from which a thing can be touched without a step: 0.6 m of arm, and a lean or a bend."""
 TOUCH = 0.08
 """Distance of a palm's frame [m] to a thing that it holds or presses: the hand radius of Boxing's rule."""
+GOAL_OBJECT, KEY_OBJECT = 0.05, 0.15
+"""Kinds of prims in `TaskSpec.recolour`, as films of looks name them (`pictures.changed_looks.Changes`)."""
 LIFT = 0.10
 """Height [m] above its support from which a thing counts as lifted: more than tilting it on an edge gives."""
 
@@ -365,8 +369,8 @@ class TaskSpec:
     light: ByRules[FixedLight | None] = field(default_factory=lambda: ByRules.same(None))
     """Distant light of the modes other than visual; None: the scene's dome."""
     recolour: Mapping[str, float] = field(default_factory=dict)
-    """Prim → probability with which changed looks may give it another colour (docs/howto/train/datasets.md): 0 where
-    the instruction names its colour or nothing else tells it apart, little where a hand must find it; else 1."""
+    """Prim → its kind in changed looks (docs/howto/train/recording.md): 0 where the instruction names its colour, which
+    it keeps; `GOAL_OBJECT` where its form tells it apart; `KEY_OBJECT` where a hand must find it; else 1, as walls."""
     mode_notes: Mapping[str, ByRules[str]] = field(default_factory=dict)
     """Mode → what it changes in this task in particular, in words, where the rule sets differ."""
 

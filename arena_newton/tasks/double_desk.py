@@ -10,7 +10,17 @@ from arena_newton.errors import InputError
 from arena_newton.interfaces import Predicate
 from arena_newton.robot.g1 import PALMS
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.base import (
+    DISTANT_LIGHT,
+    IDENTITY,
+    KEY_OBJECT,
+    LIFT,
+    REACH,
+    TOUCH,
+    ObjectSpec,
+    Required,
+    TaskSpec,
+)
 from arena_newton.tasks.handles import BodyFrame
 from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Judge, above, bounding_box, links, near, palms, top
@@ -157,7 +167,7 @@ TASK = TaskSpec(
         HAMMER, PALMS, touch=TOUCH, stance=0.40, predicate="contact", bearing=1.0, near=0.80, carried=True, loose=True
     ),
     semantic_change="texture",
-    recolour={HAMMER: 0.15, BASKET: 0.15},
+    recolour={HAMMER: KEY_OBJECT, BASKET: KEY_OBJECT},
     expert="arena_newton.policies.experts.double_desk:DoubleDeskExpert",
     disturbance=0.5,
     light=ByRules(paper=None, released=DISTANT_LIGHT),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from arena_newton.interfaces import Predicate
 from arena_newton.robot.g1 import FEET, TOE
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import FACE_PLUS_Y, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.base import FACE_PLUS_Y, GOAL_OBJECT, IDENTITY, REACH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.handles import BodyFrame
 from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, origin
@@ -150,7 +150,7 @@ TASK = TaskSpec(
         "would, and push it into the goal at the speed of the base. Only a kick is a matter of legs"
     ),
     semantic_change="texture",
-    recolour={BALL: 0.0},
+    recolour={BALL: GOAL_OBJECT},
     expert="arena_newton.policies.experts.football:FootballExpert",
     events={1: "ball_out"},
     semantic_variant=ByRules(paper="semantic", released="semantic_released"),

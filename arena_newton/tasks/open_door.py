@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from arena_newton.interfaces import Predicate
 from arena_newton.robot.g1 import PALMS
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import FACE_PLUS_Y, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.base import FACE_PLUS_Y, KEY_OBJECT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
 from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Condition, Judge, bounding_box, links, near, palms
 
@@ -153,6 +153,6 @@ TASK = TaskSpec(
         "the doorway has no sill"
     ),
     semantic_change="texture",
-    recolour={HANDLE: 0.15},
+    recolour={HANDLE: KEY_OBJECT},
     expert="arena_newton.policies.experts.open_door:OpenDoorExpert",
 )

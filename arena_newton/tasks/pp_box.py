@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING
 from arena_newton.interfaces import Predicate
 from arena_newton.robot.g1 import PALMS, TICK
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, num
-from arena_newton.tasks.base import DISTANT_LIGHT, IDENTITY, LIFT, REACH, TOUCH, ObjectSpec, Required, TaskSpec
+from arena_newton.tasks.base import (
+    DISTANT_LIGHT,
+    IDENTITY,
+    KEY_OBJECT,
+    LIFT,
+    REACH,
+    TOUCH,
+    ObjectSpec,
+    Required,
+    TaskSpec,
+)
 from arena_newton.tasks.handles import ROBOT, BodyFrame, Marker
 from arena_newton.tasks.interaction import Interaction
 from arena_newton.tasks.judge import Condition, Judge, above, bounding_box, links, near, palms, top
@@ -202,7 +212,7 @@ TASK = TaskSpec(
     ),
     light=ByRules(paper=None, released=DISTANT_LIGHT),
     semantic_change="clutter",
-    recolour={BOX: 0.15},
+    recolour={BOX: KEY_OBJECT},
     expert="arena_newton.policies.experts.pp_box:PPBoxExpert",
     disturbance=0.5,
 )

@@ -13,6 +13,7 @@ from arena_newton.rules import seeding
 from arena_newton.rules.rule_types import ByRules, PoseRange, RuleSet, SuccessRule, TaskRules, num
 from arena_newton.tasks.base import (
     FACE_PLUS_Y,
+    GOAL_OBJECT,
     REACH,
     ObjectSpec,
     Overlap,
@@ -174,7 +175,7 @@ TASK = TaskSpec(
         "gliding base are carried over the floor into it. It tests navigation; feet only by what they bump into"
     ),
     semantic_change="shape",
-    recolour={SIGN: 0.0},
+    recolour={f"{SIGN}/Frame/Outline": 0.0, SIGN: GOAL_OBJECT},
     expert="arena_newton.policies.experts.vis_navi:VisNaviExpert",
     mode_notes={
         "visual": ByRules(

@@ -11,27 +11,28 @@ from pxr import Usd, UsdGeom, UsdShade
 from arena_newton.physics.scene import SCENES
 from arena_newton.pictures import changed_looks as looks
 from arena_newton.pictures.changed_looks import Changes, changed_looks, palette, recoloured, seen_colours, unlike
+from arena_newton.tasks.base import GOAL_OBJECT, KEY_OBJECT
 
 CPU = torch.device("cpu")
 BATCH, HEIGHT, WIDTH = 32, 24, 32
-ROBOT, KEPT, SELDOM, WALL, FLOOR = 1, 2, 3, 4, 5
+ROBOT, KEPT, SELDOM, WALL, FLOOR, BALL = 1, 2, 3, 4, 5, 6
 STILL = Changes(light=0.0, exposure=0.0)
 """Neither light nor exposure, which change every pixel."""
 
 
 @pytest.fixture(scope="module")
 def batch():
-    """Noisy pictures of a robot, three things and two surfaces, of two tasks: arguments of `changed_looks`."""
+    """Noisy pictures of a robot, four things and two surfaces, of two tasks: arguments of `changed_looks`."""
     rng = np.random.default_rng(3)
     seen = rng.integers(60, 200, (BATCH, HEIGHT, WIDTH, 3), np.uint8)
     frames = np.full((BATCH, HEIGHT, WIDTH, 3), 128, np.uint8)
     frames[..., 0] = WALL
     frames[:, HEIGHT // 2 :, :, 0] = FLOOR
-    for shape, left in ((ROBOT, 0), (KEPT, 8), (SELDOM, 16)):
+    for shape, left in ((ROBOT, 0), (KEPT, 8), (SELDOM, 16), (BALL, 24)):
         frames[:, 8:16, left : left + 6, 0] = shape
     frames[:, :2, :, 0] = 0
     chances = torch.zeros(BATCH, 256)
-    chances[:, SELDOM], chances[:, WALL], chances[:, FLOOR] = 0.15, 1.0, 1.0
+    chances[:, BALL], chances[:, SELDOM], chances[:, WALL], chances[:, FLOOR] = GOAL_OBJECT, KEY_OBJECT, 1.0, 1.0
     objects, colours = torch.arange(256).expand(BATCH, -1), torch.arange(looks.COLOURS).expand(BATCH, -1)
     task = torch.arange(BATCH) % 2
     return torch.from_numpy(seen), torch.from_numpy(frames), chances, objects, colours, task
@@ -114,7 +115,8 @@ def test_shapes_get_colours_of_the_palette_alone(batch):
     pixels, luma = even.reshape(BATCH, -1, 3) / 255.0, looks.luminance(even).reshape(BATCH, -1)
     patterned, drawn = 0, set()
     for _ in range(2000 // BATCH):
-        found = recoloured(pixels, luma, shapes, objects, chances, colours, (HEIGHT, WIDTH), STILL)
+        sums = looks.shape_sums(luma, shapes)
+        found = recoloured(pixels, luma, shapes, sums, chances, objects, colours, (HEIGHT, WIDTH), STILL)
         changed = (found != pixels).any(dim=2)
         drawn |= set(coded(found[changed]).unique().tolist())
         codes = torch.where(shapes == WALL, coded(found), -1)
@@ -131,26 +133,25 @@ def test_robot_and_things_whose_colour_matters_stay(batch):
     for _ in range(10):
         changed = differ(changed_looks(*batch, STILL), seen)
         shapes = frames[..., 0]
-        assert not changed[(shapes <= KEPT)].any()
+        assert not changed[(shapes <= KEPT) | (shapes == BALL)].any()
         seldom += int(changed[shapes == SELDOM].float().mean() * 1000)
         walls += int(changed[shapes == WALL].float().mean() * 1000)
     assert 0 < seldom < 1500 and 4000 < walls < 9000
 
 
-def test_what_a_hand_must_find_changes_as_often_as_is_asked(batch):
-    """Shapes of a chance between 0 and 1 get another colour never, or as walls do; what keeps its colour keeps it."""
+@pytest.mark.parametrize(("kind", "shape", "other"), [("key_objects", SELDOM, BALL), ("goals", BALL, SELDOM)])
+def test_key_objects_and_goals_change_as_often_as_is_asked(batch, kind, shape, other):
+    """Each kind gets another colour never, or as walls do, and the other kind and what keeps its colour do not."""
     seen, frames, *_ = batch
     shapes = frames[..., 0]
     for asked in (0.0, 1.0):
         torch.manual_seed(1)
-        changed = [
-            differ(changed_looks(*batch, replace(STILL, key_objects=asked, things=0.0, rectangles=0.0)), seen)
-            for _ in range(10)
-        ]
+        alone = replace(STILL, things=0.0, rectangles=0.0, key_objects=0.0, goals=0.0)
+        changed = [differ(changed_looks(*batch, replace(alone, **{kind: asked})), seen) for _ in range(10)]
         found, walls = (
-            np.mean([float(one[shapes == kind].float().mean()) for one in changed]) for kind in (SELDOM, WALL)
+            np.mean([float(one[shapes == kind].float().mean()) for one in changed]) for kind in (shape, WALL)
         )
-        assert not any(one[shapes <= KEPT].any() for one in changed)
+        assert not any(one[(shapes <= KEPT) | (shapes == other)].any() for one in changed)
         assert found == 0.0 if asked == 0.0 else abs(found - walls) < 0.2, (found, walls)
 
 

@@ -55,14 +55,14 @@ def gathered_pictures(
     else:
         window = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
         seen = stored[numbers]
-    pictures = seen.float().div_(255.0)
     if changed is not None and (looks := store.looks) is not None:
         first = max(0, (store.height - tall) // 2 - store.top)
         frames = looks.frames[:, first : first + height][looks.number[rows].clamp_min(0)[:, None, None], *window]
         table = looks.table[rows]
         about = looks.chances[table], looks.objects[table], looks.colours[table], store.task[rows]
-        other = changed_looks(seen, frames, *about, looks.changes)
-        pictures = torch.where(changed[:, None, None, None], other, pictures)
+        pictures = changed_looks(seen, frames, *about, looks.changes, changed)
+    else:
+        pictures = seen.float().div_(255.0)
     pictures = pictures.permute(0, 3, 1, 2)
     if colour:
         change = torch.rand((batch, 4, 1, 1), device=device).mul_(2.0 * colour).add_(1.0 - colour)
