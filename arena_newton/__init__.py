@@ -5,6 +5,8 @@ of `__all__` are imported when they are first used, so that `import arena_newton
 """
 
 import importlib
+import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,6 +53,22 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 # The checkout root holds a folder `kernels/`, which would shadow the package of that name that transformers imports.
 if (_CHECKOUT / "pyproject.toml").is_file() and (_CHECKOUT / "kernels").is_dir():
     sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != _CHECKOUT]
+
+_IMPORTED = sys.orig_argv[sys.orig_argv.index("-m") + 1] if sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv else ""
+"""Module that `python -m` is about to run."""
+
+
+def leave(number: int, frame: object) -> None:
+    """Ctrl-C while a command's modules are imported, before `cli.command_line` can say so in its way."""
+    os.write(2, b"\ninterrupted\n")
+    os._exit(128 + number)
+
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler and (
+    Path(sys.argv[0]).name == "arena-newton"
+    or (_CHECKOUT.joinpath(*_IMPORTED.split("."), "__main__.py").is_file() and _IMPORTED.startswith("arena_newton"))
+):
+    signal.signal(signal.SIGINT, leave)
 
 
 def __getattr__(name: str) -> object:

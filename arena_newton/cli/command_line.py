@@ -7,10 +7,12 @@ import faulthandler
 import gc
 import io
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from arena_newton import leave
 from arena_newton.errors import ArenaError
 from arena_newton.files.text import plain_text
 
@@ -102,6 +104,8 @@ def exit_code(work: Callable[[], int | None]) -> int:
         interrupted. Whoever closes the output has seen enough: 0.
     """
     _begin_command()
+    if signal.getsignal(signal.SIGINT) is leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     gc.set_threshold(*COLLECTED)
     # An interpreter that ends looks for garbage three times among the millions of objects that compiled kernels leave,
     # which takes seconds after the last line is printed; what is frozen is not looked at. Once, however often called.

@@ -82,6 +82,39 @@ def won(line: Line) -> None:
     line["events"] = [event for event in line["events"] if event["kind"] != "fall"]
 
 
+def unplayable(line: Line) -> None:
+    """An episode as one that ended before its first action, of which there is nothing to play again."""
+    line |= {"steps": 0, "media": {}, "phases": []}
+    for key in ("actions", "final_state", "shown", "signals"):
+        line.pop(key, None)
+
+
+def won_at_once(folder: Path, lines: list[Line]) -> None:
+    """A failure made a success before the policy's first action."""
+    line = first(lines, "timeout")
+    unplayable(line)
+    won(line)
+
+
+def fell_at_once(folder: Path, lines: list[Line]) -> None:
+    """A fall said to be the tracker's in the start-up."""
+    line = first(lines, "fall")
+    unplayable(line)
+    held = dict.fromkeys(line["predicates"])
+    line |= {"reason": "startup_fall", "startup_fall": True, "predicates": held, "progress": 0.0}
+    line["events"] = [{"kind": "fall", "tick": 0, "detail": "tilt"}]
+
+
+def kept_nothing(folder: Path, lines: list[Line]) -> None:
+    """A failure made a success, of a run that is said to have kept no actions of it."""
+    line = first(lines, "timeout")
+    won(line)
+    for key in ("actions", "final_state", "shown"):
+        line.pop(key)
+    line["media"].pop("actions")
+    document(folder, options__actions=False)
+
+
 def with_predicate(folder: Path, lines: list[Line]) -> None:
     """The first predicate of a timeout said to have held in its second tick, with the progress of all that did."""
     line = first(lines, "timeout")
@@ -301,6 +334,10 @@ TABLES: dict[str, Forgery] = {
 }
 """Forgeries of derived files, by name."""
 FORGERIES: dict[str, Forgery] = TABLES | {
+    "a failure made a success at step 0": won_at_once,
+    "a fall made one in the start-up": fell_at_once,
+    "a success whose actions were not kept": kept_nothing,
+    "a metric of no recorder": edited("success", extra={"speed": 1.0}),
     "outcome alone": edited("timeout", outcome="success"),
     "outcome and reason": edited("timeout", outcome="success", reason="success"),
     "a timeout to an error": edited("timeout", outcome="error", error="the server was away"),
@@ -361,6 +398,8 @@ FORGERIES: dict[str, Forgery] = TABLES | {
     "signals of a failure": other_signals,
     "the worst group seed left out of the plan": seed_dropped,
     "weights of the policy, with all hashes": claimed(config__policy_file="0" * 12, of_lines=other_policy_file),
+    "trackers of the policy's training": claimed(config__policy_facts__trackers=["sonic"]),
+    "labels of the policy": claimed(config__labels="another"),
     "lines of an older version, and a success": downgraded,
     "a run of an older version, and a margin": claimed(
         config__version="0.0.1", of_lines=edited("success", margin=lambda line: line["margin"] + 0.01)
@@ -401,7 +440,8 @@ def level_of(
 ) -> tuple[str, list[str]]:
     """Part of an audit that finds a forgery first, and contradictions: lines, replay, policy; else head, or nothing.
 
-    A published head finds all that changes an episode; it is asked last, for folders of which none was published.
+    A replay finds also that there is nothing to play: the level stays *consistent*, as a note says. A published head
+    finds all that changes an episode; it is asked last, for folders of which none was published.
 
     Args:
         folder: The forged folder.
@@ -417,8 +457,8 @@ def level_of(
         return "lines", found.faults
     for level, asked in (("replay", None), ("policy", policy))[: 1 if policy is None else 2]:
         replay(found, drawn(found, None, 0), factories, policy=asked)
-        if found.faults:
-            return level, found.faults
+        if found.faults or found.absent:
+            return level, found.faults or found.notes
     known = audited(folder, published).faults
     return "head" if known else "", known
 

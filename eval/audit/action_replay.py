@@ -22,7 +22,7 @@ from arena_newton.eval.audit.claimed_conditions import (
     note_difference,
 )
 from arena_newton.eval.audit.draws import odds
-from arena_newton.eval.audit.folder_audit import ENGINE, Audit
+from arena_newton.eval.audit.folder_audit import CONSISTENT, ENGINE, Audit
 from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, STILL, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
 from arena_newton.eval.plan.config import RunConfig, resolve
@@ -51,6 +51,10 @@ EVIDENCE = ("final_state", "shown")
 """Hashes of a line that it must give again, where the line has them."""
 DECIDED = ("outcome", "reason")
 """Keys of a line that episodes of another engine must give when each tick is checked from its recorded state."""
+STANDING = "stand"
+"""Policy by which falls in the start-up are played again: it ends before the first action."""
+SCRIPTED = ("expert", "stand")
+"""Policies that are made of this package alone, so that what they say of themselves is known without a file."""
 DRIFT = 4.0
 """Tolerances of a tick that the differences of a second may add up to."""
 UNITS = {"positions": "m", "velocities": "m/s or rad/s"}
@@ -97,12 +101,19 @@ def replay(
     run, made = audit.run, factories or Factories()
     stored, where = stored_options(run.folder), f"--replay: {run.folder}"
     by_tick = run.config.get("engine") != ENGINE
-    if by_tick and not all(EPISODE in (record.media or {}) for record in records):
+    if by_tick and not all(EPISODE in (record.media or {}) for record in records if record.steps):
         engine = f"was played on engine {shown(run.config.get('engine'))}, and {ENGINE} alone repeats bits"
         raise InputError(f"{where} {engine}; ticks are checked one by one where states were recorded (--record)")
     if stored.series is not None:
         raise InputError(f"{where} holds demonstrations; `eval record --from` plays them again")
     totals = _Totals()
+    if fell := [record for record in records if by_tick and not record.steps]:
+        audit.notes.append(f"{counted(len(fell), 'fall')} in the start-up not played again: no state was recorded.")
+        records = [record for record in records if record.steps]
+    drawn, records = len(records), [record for record in records if record.index not in audit.lacking]
+    if absent := drawn - len(records):
+        audit.absent = absent
+        audit.notes.append(f"Of {counted(absent, 'episode')} to play again the actions are not there: {CONSISTENT}.")
     if records:
         tolerances = tick_tolerance, velocity_tolerance
         _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tolerances=tolerances)
@@ -137,12 +148,13 @@ class _Totals:
     largest: float = 0.0
     """Largest difference of one."""
     furthest: tuple[float, ...] = (0.0,) * 4
-    """Largest difference of a position [m] and a velocity [m/s, rad/s] after a tick, and added up over a second."""
+    """Largest difference of a position [m] and a velocity [m/s, rad/s] in the first state or after a tick, and added
+    up over a second."""
 
     def add(self, found: TickDifferences) -> None:
         """Take up the ticks of an episode."""
         largest = (float(values.max()) for values in (*found.of_ticks(), *found.of_seconds()))
-        self.furthest = tuple(map(max, self.furthest, largest))
+        self.furthest = tuple(map(max, self.furthest, largest, (found.first, found.first_speed, 0.0, 0.0)))
 
 
 def _play(
@@ -159,35 +171,38 @@ def _play(
 ) -> None:
     """Play these episodes of a folder's plan, and compare each."""
     run, wanted = audit.run, {_key(record): record for record in records}
-    plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}"))
+    acted = any(record.steps for record in records)
+    plan = resolve(rollout_flags(stored, f"replay:{run.folder / 'actions'}" if acted else STANDING))
     _note_differences(audit, plan, ("code", "scenes", "rules_hash"))
     measured = bool(stored.recorder) or made.recorders is not Factories.recorders
-    asked = plan if policy is None else resolve(rollout_flags(stored, policy, Chunks))
+    own = policy or (str(run.config["policy"]) if run.config["policy"] in SCRIPTED else None)
+    asked = plan if own is None else resolve(rollout_flags(stored, own, Chunks))
     made = dataclasses.replace(made, tracker=_without_window(made, f"--replay: {run.folder}"))
     with contextlib.ExitStack() as ended:
         parts = []
         for tracker in dict.fromkeys(record.tracker for record in records):
             actions = run.folder / actions_folder(stored.tracker, tracker)
-            chosen = tuple(one for one in plan.episodes if one.tracker == tracker and _key(one) in wanted)
-            config = dataclasses.replace(through(plan, tracker, chosen), policy=f"replay:{actions}")
-            config, player = check_parts(config, made)
-            ended.callback(player.close)
-            parts.append((tracker, chosen, config, player))
+            mine = [one for one in plan.episodes if one.tracker == tracker and _key(one) in wanted]
+            for spec, acts in ((f"replay:{actions}", True), (STANDING, False)):
+                if chosen := tuple(one for one in mine if bool(wanted[_key(one)].steps) is acts):
+                    config = dataclasses.replace(through(plan, tracker, chosen), policy=spec)
+                    config, player = check_parts(config, made)
+                    ended.callback(player.close)
+                    parts.append((tracker, chosen, config, player))
         for tracker, chosen, config, player in parts:
-            if not by_tick:
-                hold_plan(audit, config)
+            hold_plan(audit, config)
             again: Policy | None = None
-            if policy is not None:
-                other, again = check_parts(through(asked, tracker, chosen), made)
-                ended.callback(again.close)
-                _note_differences(audit, other, ("policy", "policy_facts", "labels"))
-                hold_policy(audit, other)
+            if own is not None and config.policy != STANDING:
+                other, itself = check_parts(through(asked, tracker, chosen), made)
+                ended.callback(itself.close)
+                named = hold_policy(audit, other)
+                again, audit.asked_policy = (None, None) if policy is None else (itself, named)
             for (task, _, mode), group in groups(chosen).items():
                 name = f"{task} {tracker} {mode}"
                 cameras = stored_cameras(audit, name) if again is None else other.cameras
                 lines = {episode.index: wanted[_key(episode)] for episode in group}
                 media = {index: line.media or {} for index, line in lines.items()}
-                recorded = {i: RecordedQueries.read(run.folder / files["actions"]) for i, files in media.items()}
+                recorded = {i: RecordedQueries.read(run.folder, files.get("actions")) for i, files in media.items()}
                 seen = AskedAgain(recorded, again, latency=stored.latency_ticks, tolerance=tolerance)
                 states = StatesAgain({i: run.folder / files.get(EPISODE, "") for i, files in media.items()})
                 signals: list[SignalRecorder] = []
@@ -341,6 +356,9 @@ def _compare_ticks(
         audit.faults.append(f"{where}: ended after {record.steps} steps, its recorded states end after {result.steps}")
     if found.first > START:
         audit.faults.append(f"{where}: its first state is {found.first:.2g} m from that of its seed")
+    if found.first_speed > tolerances[1]:
+        far = f"{found.first_speed:.2g} {UNITS['velocities']}"
+        audit.faults.append(f"{where}: velocities of its first state are {far} from those that its seed gives")
     if found.states <= min(record.steps, result.steps):
         few = counted(max(found.states - 1, 0), "tick")
         audit.faults.append(f"{where}: states of its first {few} alone are recorded")

@@ -29,12 +29,15 @@ class RecordedQueries:
     """Ticks; none of an episode of a version that did not keep them."""
 
     @classmethod
-    def read(cls, path: Path) -> RecordedQueries:
-        """Read a file of actions.
+    def read(cls, folder: Path, name: str | None) -> RecordedQueries:
+        """Read a file of actions, by its path in a results folder; without one there are none.
 
         Raises:
             InputError: It is absent or damaged.
         """
+        if name is None:
+            return cls(np.zeros((0, 40), np.float32), frozenset())
+        path = folder / name
         arrays = read_arrays(path, ("action", "queries"))
         queries = numbers(arrays.get("queries", np.zeros(0)), f"{path}: queries", np.float64)
         return cls(arrays["action"], frozenset(np.ravel(queries).tolist()))

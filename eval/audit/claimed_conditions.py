@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 from arena_newton.eval.audit.folder_audit import Audit
 from arena_newton.eval.plan.config import RunConfig, plain_facts
-from arena_newton.eval.play.signal_recorder import SignalRecorder
 from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord
 from arena_newton.files.stored_json import Json, shown
 from arena_newton.interfaces import World
 
-__all__ = ["hold_environment", "hold_plan", "hold_policy", "hold_signals", "note_difference"]
+if TYPE_CHECKING:
+    from arena_newton.eval.play.signal_recorder import SignalRecorder
+
+__all__ = ["POLICY", "hold_environment", "hold_plan", "hold_policy", "hold_signals", "note_difference"]
+__all__ += ["misnamed_policy", "named_policy", "policy_kind"]
 
 CLAIMED = "task mode seeds repeats rules max_steps variant fast_physics drive checkpoint".split()
 """Keys of a run's identity that a replay must have too."""
@@ -21,6 +25,10 @@ DESCRIBED = "tracker_facts mode_facts foreign_tasks".split()
 """Keys that say what code is: they may differ where that is another version's."""
 ELSEWHERE = ("device", "tracker", "recorders")
 """Facts of an environment that depend on the machine, or on the programs that are here."""
+POLICY = "policy policy_file labels policy_facts".split()
+"""Keys of a run's identity that name its policy."""
+TABLED = "privileged weights family recipe tasks trackers labels".split()
+"""Facts of a policy that tables are made of: no other version of the code explains them."""
 RATES = ("physics_dt", "substeps", "startup_ticks")
 """Facts of an environment that no other version of the code explains: without them no replay gives the same bits."""
 ROUNDED = 2e-4
@@ -51,15 +59,45 @@ def hold_plan(audit: Audit, config: RunConfig) -> None:
             _contradict(audit, f"{where} is {shown(was)}, its flags give {shown(now)}")
 
 
-def hold_policy(audit: Audit, config: RunConfig) -> None:
-    """Hold the weights that the run names to those of the policy that is asked again; a server's are not known."""
-    was, now = audit.run.config.get("policy_file"), config.policy_hash
-    if was is None or now is None:
+def policy_kind(spec: Json) -> str:
+    """Kind of a policy, such as `lerobot`; the path after it is shortened in an identity."""
+    return str(spec).partition(":")[0]
+
+
+def named_policy(config: Mapping[str, Json]) -> dict[str, Json]:
+    """Spec, file, labels and facts of the policy that an identity names, and the code that gives the facts."""
+    return {key: config.get(key) for key in (*POLICY, "code")}
+
+
+def hold_policy(audit: Audit, config: RunConfig) -> dict[str, Json]:
+    """Hold the policy that the run names to one that was made here; its names (`named_policy`)."""
+    claimed, here = named_policy(audit.run.config), named_policy(config.identity())
+    for text in misnamed_policy(claimed, here):
+        _contradict(audit, f"{audit.run.folder / CONFIG_FILE}: config: {text}")
+    for key in POLICY:
+        if claimed[key] != here[key]:
+            note_difference(audit, key)
+    return here
+
+
+def misnamed_policy(claimed: Mapping[str, Json], asked: Mapping[str, Json]) -> Iterator[str]:
+    """Differences of a policy that a run names from the one that was asked again, both as `named_policy` gives them.
+
+    Those of another kind, such as a server, are not known. Facts of which no table is made may differ where code does.
+    """
+    if policy_kind(claimed["policy"]) != policy_kind(asked["policy"]):
+        return
+    facts, others = (_object(one["policy_facts"]) for one in (claimed, asked))
+    pairs = [(key, claimed[key], asked[key]) for key in ("policy_file", "labels")]
+    names = {*facts, *others} if claimed["code"] == asked["code"] else TABLED
+    pairs += [(f"policy_facts: {key}", facts.get(key), others.get(key)) for key in sorted(names)]
+    for key, was, now in pairs:
         if was != now:
-            note_difference(audit, "policy_file")
-    elif was != now:
-        where = f"{audit.run.folder / CONFIG_FILE}: config: policy_file"
-        _contradict(audit, f"{where} is {shown(was)}, the policy that was asked again has {shown(now)}")
+            yield f"{key} is {shown(was)}, of the policy itself {shown(now)}"
+
+
+def _object(value: Json) -> dict[str, Json]:
+    return value if isinstance(value, dict) else {}
 
 
 def hold_environment(audit: Audit, config: RunConfig, group: str, env: World) -> None:

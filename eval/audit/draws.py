@@ -17,17 +17,19 @@ FORGED = (0.01, 0.05, 0.1, 0.25)
 """Fractions of forged lines for which an audit says how probably the drawn episodes find one."""
 
 
-def drawn(audit: Audit, count: int | None, seed: int, lacking: Collection[int] | None = None) -> list[EpisodeRecord]:
+def drawn(audit: Audit, count: int | None, seed: int, without: Collection[int] = ()) -> list[EpisodeRecord]:
     """Episodes to play again, drawn by the head of the journal and a number of the auditor's own.
+
+    Those whose actions are not there are drawn too: whoever leaves them out must not choose what is played again.
 
     Args:
         audit: Of the folder; episodes that ended as errors cannot be drawn.
         count: Number of them; None: all.
         seed: The auditor's number. Whoever forged the folder must not know it before the head is published.
-        lacking: Numbers of the episodes without actions, which cannot be drawn; by default those that the audit found.
+        without: Numbers of episodes to leave out.
     """
-    gone = set(audit.lacking if lacking is None else lacking)
-    candidates = [r for r in audit.run.records if r.index not in gone and r.steps and r.outcome != "error"]
+    gone = set(without)
+    candidates = [record for record in audit.run.records if record.index not in gone and record.outcome != "error"]
     if count is None or count >= len(candidates):
         return candidates
     chosen = random.Random(f"{audit.head} {seed}").sample(range(len(candidates)), count)

@@ -68,7 +68,9 @@ class Audit:
     notes: list[str] = field(default_factory=list)
     """Remarks: what could not be checked, and why."""
     lacking: list[int] = field(default_factory=list)
-    """Numbers of the episodes whose actions are not there."""
+    """Numbers of the episodes whose actions are not there, or were not kept."""
+    absent: int = 0
+    """Number of those among the episodes that should have been played again."""
     replayed: int | None = None
     """Episodes that were played again; None: that was not asked for."""
     draw: int | None = None
@@ -77,6 +79,8 @@ class Audit:
     """Their numbers in the plan."""
     policy: str | None = None
     """Spec of the policy that was asked again."""
+    asked_policy: JsonObject | None = None
+    """File, labels and facts of that policy, and the code that gives them."""
     tolerance: float = 0.0
     """Largest difference of an action that was still taken for the policy's."""
     asked: int | None = None
@@ -92,9 +96,9 @@ class Audit:
         """Highest level without a contradiction."""
         if self.faults:
             return SELF_REPORTED
-        if self.asked:
-            return RERUN
-        return REPLAYED if self.replayed else CONSISTENT
+        if not self.replayed or self.absent:
+            return CONSISTENT
+        return RERUN if self.asked else REPLAYED
 
     @property
     def head(self) -> str:
@@ -120,6 +124,7 @@ class Audit:
             "played": self.played,
             "policy": self.policy,
             "asked": self.asked,
+            "asked_policy": self.asked_policy,
             "tolerance": self.tolerance,
             "largest differences": self.largest,
         }

@@ -92,6 +92,8 @@ def line_faults(run: RunRecord, records: Sequence[EpisodeRecord]) -> Iterator[st
         details = [*_ending(record, facts), *_ticks(record)]
         if record.schema > 1 and record.task in known and record.outcome != "error":
             details += _predicates(record)
+        if record.extra and not (run.document["options"].get("recorder") or (facts or {}).get("recorders")):
+            details.append(f"has metrics ({' '.join(record.extra)}), and the run no recorder")
         if watched and record.signals is None and record.steps:
             details.append("has no signals of its failure, which the run kept")
         for text in details:
@@ -179,7 +181,7 @@ def action_faults(run: RunRecord, records: Sequence[EpisodeRecord], lacking: lis
         if record.actions is None:
             if kept and record.schema >= CHAINED and record.steps:
                 yield f"{where}: has no hash of its actions, which the run kept"
-            lacking.append(record.index)
+            lacking += [record.index] * bool(record.steps)  # of an error or fall before step 0 there are none
             continue
         name = f"{record.task}_{record.mode}_s{record.group_seed}_r{record.repeat}.npz"
         path = f"{actions_folder(several, record.tracker)}/{name}"

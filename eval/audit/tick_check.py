@@ -42,6 +42,8 @@ class TickDifferences:
 
     first: float = 0.0
     """Largest distance along an axis of a body in the first state from where the seed puts it [m]."""
+    first_speed: float = 0.0
+    """Largest difference of a velocity in it from the one that the seed's start-up gives [m/s, rad/s]."""
     states: int = 0
     """Recorded states that were compared."""
     positions: list[np.ndarray] = field(default_factory=list)
@@ -190,14 +192,18 @@ class StatesAgain(Recorder):
         bodies = env.physics.xpos.numpy()[world]
         given, moving = bodies.astype(np.float64), env.physics.qvel.numpy()[world].astype(np.float64)
         env.physics.put(world, mine.positions[tick], mine.velocities[last])
-        if found.states:
-            found.positions.append(bodies - given)
-            if tick == last:
-                gained, quats = (mine.velocities[tick] - moving) * mine.lone.radii, env.physics.xquat.numpy()[world]
-                found.velocities.append(gained)
-                near = mine.bodies, bodies, bodies - given
-                worst = mine.lone.worst(*near, gained, mine.velocities[tick], quats.astype(np.float64))
-                found.unmoved = max(found.unmoved, (worst, tick - 1), key=lambda one: one[0])
+        moved, begins = bodies - given, not found.states
+        if begins:
+            found.first, moved, mine.bodies = float(np.abs(moved).max()), np.zeros_like(moved), bodies
         else:
-            found.first = float(np.abs(bodies - given).max())
+            found.positions.append(moved)
+        if tick == last:
+            gained, quats = (mine.velocities[tick] - moving) * mine.lone.radii, env.physics.xquat.numpy()[world]
+            if begins:
+                found.first_speed = float(np.abs(gained).max())
+            else:
+                found.velocities.append(gained)
+            near = mine.bodies, bodies, moved
+            worst = mine.lone.worst(*near, gained, mine.velocities[tick], quats.astype(np.float64))
+            found.unmoved = max(found.unmoved, (worst, max(tick - 1, 0)), key=lambda one: one[0])
         found.states, mine.bodies = found.states + 1, bodies.astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,7 +42,7 @@ from arena_newton.trackers import shipped_weights
 if TYPE_CHECKING:
     from arena_newton.eval.play.factories import Factories
 
-__all__ = ["CheckedEntry", "check_entry"]
+__all__ = ["CheckedEntry", "check_entry", "played_elsewhere"]
 
 PROTOCOL_RULES = "paper"
 """Rule set of the protocol."""
@@ -90,6 +91,7 @@ def check_entry(
         except InputError as error:
             raise InputError(str(error).replace(str(into), str(folder / BUNDLE_FILE))) from None
         checked.rates += [replace(rate_of_cell(cell), unusual=_unusual(cell)) for cell in cells]
+        checked.faults += [f"{checked.name}/{BUNDLE_FILE}: {fault}" for fault in _twice(cells, checked.rates)]
         if entry.training_data == UNTRAINED:  # a policy of many tasks without a merged training
             checked.rates = [replace(rate, setting=IN_GMT) for rate in checked.rates]
         checked.faults += [f"{where}: {fault}" for fault in _misstated(entry, cells)]
@@ -127,6 +129,30 @@ def _misstated(entry: BoardEntry, cells: Sequence[PlayedCell]) -> Iterator[str]:
         yield f"training_data is {data}, policy {scripted[0]} of its runs is not trained"
 
 
+def _twice(cells: Sequence[PlayedCell], rates: Sequence[ConditionRate]) -> Iterator[str]:
+    """Places of the board for which an entry has two rates, of which the board would show one."""
+    seen: dict[tuple[str, ...], PlayedCell] = {}
+    for cell, rate in zip(cells, rates, strict=True):
+        other = seen.setdefault((*rate.row, rate.task, rate.unusual), cell)
+        if other is not cell:
+            both = " and ".join(shown(one.records[0].policy) for one in (other, cell))
+            yield f"{rate.task} {rate.tracker} {rate.mode} has two rates, of the policies {both}; an entry is of one"
+
+
+def played_elsewhere(entry: CheckedEntry, others: Sequence[CheckedEntry]) -> Iterator[str]:
+    """Entries among others that have episodes of one: a run of one head, or equal actions from one seed."""
+    mine = _evidence(entry)
+    for other in others:
+        if shared := mine & _evidence(other):
+            yield f"{entry.name}/{BUNDLE_FILE}: {len(shared)} of its runs and episodes are those of entry {other.name}"
+
+
+def _evidence(entry: CheckedEntry) -> set[str]:
+    """Hashes that no two entries share: heads of its runs, and of each episode its seed with the actions."""
+    actions = (record.actions for audit in entry.audits for record in audit.run.records)
+    return {audit.head for audit in entry.audits} | {one for one in actions if one is not None}
+
+
 def _hold_level(checked: CheckedEntry, folder: Path, *, at_hand: bool) -> None:
     """Hold the level that an entry claims to what it carries, and say what its audit covers.
 
@@ -158,19 +184,20 @@ def _audit(
     checked: CheckedEntry, root: Path, replays: int, draw: int, factories: Factories | None
 ) -> Sequence[PlayedCell]:
     """Audit every run of an unpacked bundle; its cells."""
-    folders, suite = runs_in(root), (root / SUITE_FILE).exists()
+    folders, suite, notes = runs_in(root), (root / SUITE_FILE).exists(), Counter[str]()
     for folder in folders:
         audit = audited(folder)
         if replays:
             from arena_newton.eval.audit.action_replay import replay  # loads the simulator
 
-            replay(audit, drawn(audit, replays, draw), factories)
+            replay(audit, drawn(audit, replays, draw, audit.lacking), factories)
         checked.audits.append(audit)
         checked.faults += [fault.replace(f"{root}/", f"{checked.name}/") for fault in audit.faults]
-        checked.notes += [note.replace(f"{root}/", f"{checked.name}/") for note in audit.notes]
+        notes.update(note.replace(f"{root}/", f"{checked.name}/") for note in audit.notes)
         if not (suite or audit.results["complete"]):  # failures may be what is left out; a suite's tables leave it out
             number = f"{audit.results['finished']} of {audit.results['planned']} episodes"
             checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: a run of {number}; rates are of whole plans")
+    checked.notes += [f"{note} ({counted(runs, 'run')})" if runs > 1 else note for note, runs in notes.items()]
     found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
     if not found:
         checked.faults.append(

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 from arena_newton.errors import InputError
+from arena_newton.eval.audit.claimed_conditions import misnamed_policy, named_policy, policy_kind
 from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.audit.folder_audit import AUDIT_FILE, CONSISTENT, ENGINE, REPLAYED, RERUN, Audit
 from arena_newton.eval.leaderboard.entry_file import BUNDLE_FILE
+from arena_newton.eval.records.document import CONFIG_FILE
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
-from arena_newton.files.stored_json import Fit, JsonObject, Name, loaded, parse, read_regular, shown
+from arena_newton.files.stored_json import Facts, Fit, JsonObject, Name, loaded, parse, read_regular, shown
 from arena_newton.files.text import counted, plain_text
 
 __all__ = ["LEAST", "AuditStatement", "earned_level", "read_statements"]
@@ -45,6 +47,8 @@ class AuditStatement:
     """Episodes at whose queries it was asked."""
     tolerance: float
     """Largest difference of an action that was taken for its."""
+    asked_policy: Annotated[Facts | None, Fit("facts by name or null")] = None
+    """File, labels and facts of that policy (`claimed_conditions.named_policy`)."""
 
 
 def read_statements(folder: Path) -> dict[str, AuditStatement]:
@@ -96,15 +100,13 @@ def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement])
             return f"{AUDIT_FILE}: contradictions: {plain_text(one.contradictions[0], 200)}"
         if (engine := audit.run.config.get("engine")) != ENGINE:
             return f"{BUNDLE_FILE}: engine is {shown(engine)}, {ENGINE} alone repeats bits"
-        acted = [record for record in audit.run.records if record.steps and record.outcome != "error"]
-        without = [record.index for record in acted if record.actions is None]
         wanted = None if one.draw is None else len(one.played)
-        if list(one.played) != [record.index for record in drawn(audit, wanted, one.draw or 0, without)]:
+        if list(one.played) != [record.index for record in drawn(audit, wanted, one.draw or 0)]:
             by = "all episodes" if one.draw is None else f"what draw {one.draw} draws by the head"
             return f"{AUDIT_FILE}: played is not {by}"
         if gone := sorted(set(one.played) & set(audit.lacking)):
             return f"{BUNDLE_FILE}: actions of episode {gone[0]}, which was played again, are not there"
-        number, playable = number + len(one.played), playable + len(acted)
+        number, playable = number + len(one.played), playable + len(drawn(audit, None, 0))
     if number < (least := min(LEAST, playable)):
         return f"{AUDIT_FILE}: played is {counted(number, 'episode')}, expected at least {least}"
     return ""
@@ -116,9 +118,14 @@ def _not_asked(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) ->
         one, played = stated[audit.head], str(audit.run.config["policy"])
         if one.policy is None or one.asked != len(one.played):
             return f"{AUDIT_FILE}: asked is {shown(one.asked)} of {counted(len(one.played), 'episode')} played again"
-        kind, own = one.policy.partition(":")[0], played.partition(":")[0]
+        kind, own = policy_kind(one.policy), policy_kind(played)
         if kind not in (own, *SERVED) and own not in SERVED:
             return f"{AUDIT_FILE}: policy is {shown(one.policy)}, its run has {shown(played)}"
+        asked = named_policy(one.asked_policy or {})
+        if policy_kind(asked["policy"]) != kind:
+            return f"{AUDIT_FILE}: asked_policy: policy is {shown(asked['policy'])}, expected {shown(one.policy)}"
+        for text in misnamed_policy(named_policy(audit.run.config), asked):
+            return f"{CONFIG_FILE}: {text}"
         if not 0 <= one.tolerance <= MOST_TOLERANCE:
             return f"{AUDIT_FILE}: tolerance is {one.tolerance:g}, expected at most {MOST_TOLERANCE:g}"
     return ""

@@ -63,10 +63,10 @@ def made_bundle(
             raise InputError(f"{audit.faults[0]}; all contradictions: eval audit {folder}")
         inside = audit.run.folder
         names += [inside / CONFIG_FILE, inside / JOURNAL_FILE]
-        chosen = drawn(audit, actions, 0) if actions else []
+        chosen = drawn(audit, actions, 0, audit.lacking) if actions else []
         if (one := stated.get(audit.head)) is not None and one.played:
             chosen = [record for record in audit.run.records if record.index in set(one.played) - set(audit.lacking)]
-        paths = {inside / str((record.media or {})["actions"]): record.schema for record in chosen}
+        paths = {inside / str((record.media or {})["actions"]): record.schema for record in chosen if record.steps}
         columns |= {path for path, schema in paths.items() if schema >= BY_CONTENT}
         names += paths
         names += [path for _, path in strips_of(audit.run)][:strips]

@@ -194,6 +194,8 @@ def contradiction(record: EpisodeRecord) -> str | None:
         return f"a timeout after {record.steps} of {record.max_steps} steps"
     elif record.outcome == "fall" and record.schema > 1 and fell is None:
         return "a fall without the event fall"
+    if not record.steps and record.outcome != "error" and not record.startup_fall:
+        return f"a {record.outcome} at step 0, before the policy's first action"
     if record.outcome != "fall" and fell is not None and fell < record.steps:
         return f"a {record.outcome} at step {record.steps} after a fall at {fell}"
     return None

@@ -190,16 +190,15 @@ def cells_of(run: RunRecord) -> list[PlayedCell]:
 
 
 def _suite_cell(cell: SuiteCell, run: RunRecord) -> PlayedCell:
+    """Cell of a suite: its name there, and of its training what the run itself does not say."""
+    own = cells_of(run)[0]
+    known = bool(own.trained_on) or own.family in UNTRAINED
     return dataclasses.replace(
-        cells_of(run)[0],
+        own,
         policy=dataclasses.replace(run.records[0], policy=cell.policy).shown_policy,
-        family=cell.family,
-        trained_on=tuple(sorted(cell.trained_on, key=_tracker_order)),
-        trained_tasks=cell.trained_tasks,
-        labels=cell.labels,
-        latency=cell.latency,
-        replan=cell.replan,
-        ensemble=cell.ensemble,
+        family=own.family or cell.family,
+        trained_on=own.trained_on if known else tuple(sorted(cell.trained_on, key=_tracker_order)),
+        trained_tasks=own.trained_tasks if known else cell.trained_tasks,
         records=tuple(run.records),
         wall_s=cell.wall_s,
         device=cell.device,

@@ -37,6 +37,25 @@ def test_every_program_of_the_package_has_a_command():
     assert programs == {command.module for command in COMMANDS}
 
 
+INTERRUPTING = """import os, signal, sys
+class Finder:
+    def find_spec(self, name, path, target=None):
+        if name == os.environ["INTERRUPTED_AT"]:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.parametrize("at", ["arena_newton.cli.command_line", "arena_newton.eval.__main__", "arena_newton.tasks"])
+def test_an_interrupted_import_is_one_word(tmp_path, at):
+    """Ctrl-C while a command's own modules are imported, before it can catch it, is no traceback, and code 130."""
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING)
+    command = [sys.executable, "-m", "arena_newton.eval", "list", "--task", "football"]
+    variables = os.environ | {"PYTHONPATH": str(tmp_path), "INTERRUPTED_AT": at}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.strip(), done.stdout) == (130, "interrupted", "")
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)
 def test_every_command_explains_itself(command, capsys):
     """`--help` behind each command's words is the command's own and ends with 0."""

@@ -51,7 +51,9 @@ def cell_of(policy, family, tracker, task, *, trained_on=None, mode="base", labe
 
 def write_cell(folder, cell, results, rules="paper", played=None, **config):
     """The results folder of a cell: seeds 0 1 2 x 20, ended as `results` says; `played` of them, all by default."""
-    identity = {"task": [cell.task], "mode": [cell.mode], "tracker": [cell.tracker], "policy": cell.spec} | config
+    identity = {"task": [cell.task], "mode": [cell.mode], "tracker": [cell.tracker], "policy": cell.spec}
+    executed = {"latency_ticks": cell.latency, "replan": cell.replan, "ensemble": cell.ensemble}
+    identity |= {"labels": cell.labels} | {key: value for key, value in executed.items() if value} | config
     document = document_of(len(SEEDS) * REPEATS, rules=rules, **identity)
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(document))

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -190,12 +191,14 @@ def test_bytes_that_are_no_line_are_said(folder, capsys):
 REPLAYED = {"a larger margin", "a predicate and progress", "final state", "what the policy was shown"}
 REPLAYED |= {"a failure made a success", "every failure made a success", "a success under the seed of a failure"}
 REPLAYED |= {"weights of trackers, with all hashes", "an environment, with its hash"}
-REPLAYED |= {"code and an environment, with all hashes"}
+REPLAYED |= {"code and an environment, with all hashes", "a success whose actions were not kept"}
+REPLAYED |= {"a fall made one in the start-up", "lines of an older version, and a success"}
+REPLAYED |= {"trackers of the policy's training", "labels of the policy", "weights of the policy, with all hashes"}
 REPLAYED |= {"a run of an older version, and a margin"}
 LEVEL = dict.fromkeys(REPLAYED, "replay")
 LEVEL |= dict.fromkeys(("a timeout to an error", "a line dropped, unfinished", "actions changed, with hash"), "head")
-LEVEL |= dict.fromkeys(("the worst group seed left out of the plan", "weights of the policy, with all hashes"), "head")
-LEVEL |= {"lines of an older version, and a success": "head", "another drive in tables and flags": "head"}
+LEVEL |= {"the worst group seed left out of the plan": "head"}
+LEVEL |= {"another drive in tables and flags": "head"}
 """Means that find a forgery, where lines alone do not; the world of these tests heeds no action."""
 
 
@@ -413,6 +416,7 @@ def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
     ticks = len(arrays["arena_qvel"])
     for name, at, by, said in (
         ("arena_qvel", 0, 2.0 * (np.arange(ticks) == 7), "m/s or rad/s from what mujoco gives"),
+        ("arena_qvel", 0, 2.0 * (np.arange(ticks) == 0), "velocities of its first state are 2 m/s"),
         ("arena_qvel", -5, 0.9 * (np.arange(ticks) == 7), "until tick 6 a body that nothing moved got 0.8"),
         ("arena_qpos", 0, 0.003 * np.arange(ticks), "positions added up over a second from tick 0 on are 0.0"),
         ("arena_qpos", 0, 0.05 * (np.arange(ticks) >= 7), "positions after tick 6 are 0.05 m from what mujoco gives"),
@@ -423,6 +427,16 @@ def test_ticks_of_engine_warp_are_checked_one_by_one(parts, tmp_path, capsys):
         np.savez_compressed(path, **arrays | forged)
         assert main(["audit", str(run), "--all"], parts) == 1
         assert said in capsys.readouterr().out
+    forged = {name: arrays[name].copy() for name in ("arena_qpos", "arena_qvel")}
+    turned = np.zeros(3)  # a ball that rolls from the first state on: each tick follows from the one before
+    mujoco.mju_rotVecQuat(turned, np.array([0.0, 0.12 / 0.11, 0.0]), arrays["arena_qpos"][0, -4:] * [1, -1, -1, -1])
+    forged["arena_qvel"][:, -6:] += [0.12, 0.0, 0.0, *turned]
+    forged["arena_qpos"][:, -7] += 0.12 * 0.02 * np.arange(ticks)
+    np.savez_compressed(path, **arrays | forged)
+    forge(run, FORGERIES["weights of trackers, with all hashes"])
+    assert main(["audit", str(run), "--all"], parts) == 1
+    said = capsys.readouterr().out
+    assert "until tick 0 a body that nothing moved got 0.11 m/s" in said and "config: checkpoint is" in said, said
     for ticks, code in ((6, 1), (0, 2)):
         few = {name: arrays[name][:ticks] for name in ("arena_qpos", "arena_qvel")}
         np.savez_compressed(path, **arrays | few | {"arena_final_qpos": arrays["arena_qpos"][ticks]})

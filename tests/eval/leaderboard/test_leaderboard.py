@@ -19,6 +19,7 @@ from arena_newton.eval.__main__ import main
 from arena_newton.eval.audit import folder_audit
 from arena_newton.eval.audit.draws import drawn
 from arena_newton.eval.leaderboard.entry_file import BoardEntry
+from arena_newton.eval.records.identity import config_hash
 
 ROOT = Path(__file__).resolve().parents[3]
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--seeds", "0", "--repeats", "4"]
@@ -243,6 +244,41 @@ def test_an_edited_result_is_found(entry, edit, named, capsys):
     assert code == 1 and named in said and not site.exists(), said
 
 
+def test_an_entry_is_of_one_policy_and_of_one_owner(made, entry, capsys):
+    """Two policies in one place, of which a board would show the better, and another entry's episodes contradict."""
+    both = made.parent / "both"
+    shutil.copytree(made.parent / "run", both / "expert", dirs_exist_ok=True)
+    assert main([*FLAGS, "--policy", "stand", "--out", str(both / "stand")], factories()) == 0
+    assert main(["bundle", str(both), "--out", str(entry.parent / "both")]) == 0
+    fill(entry.parent / "both", **KEYS)
+    code, said, site = build(entry.parent / "both", capsys)
+    assert code == 1 and said.count("base has two rates, of the policies") == 4 and not site.exists(), said
+    assert (
+        said.count("derived files not there") == 1 and "derived files not there, such as results.json. (2 runs)" in said
+    )
+    theirs = shutil.copytree(entry, entry.parent / "theirs")
+    repacked(theirs, renamed)
+    with zipfile.ZipFile(theirs / "bundle.zip") as archive:
+        archive.extractall(entry.parent / "unpacked")
+    fill(theirs, head=folder_audit.audited(entry.parent / "unpacked").head, name="Theirs")
+    assert build(theirs, capsys)[0] == 0  # alone it is sound: what its owner renamed, nothing in it shows
+    assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
+    said = capsys.readouterr().out
+    assert "theirs/bundle.zip: 8 of its runs and episodes are those of entry ours" in said, said
+
+
+def renamed(members):
+    """The runs of another under a policy of another name."""
+    content = json.loads(members["config.json"])
+    content["config"]["policy"] = content["options"]["policy"] = "mine"
+    content["config_hash"] = hashed = config_hash(content["config"])
+    lines = [json.loads(line) | {"policy": "mine"} for line in members["episodes.jsonl"].splitlines()]
+    for line in lines:
+        line["hashes"]["config"] = hashed
+    members["config.json"] = json.dumps(content).encode()
+    relinked(members, lines)
+
+
 @pytest.fixture(scope="module")
 def audited(made):
     """An entry of the run after an audit that played all its episodes again and asked the policy."""
@@ -293,13 +329,22 @@ def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
             'replayed: audit.json: policy is "stand", its run has "expert"',
         ),
         (lambda entry: stated(entry, tolerance=1.0), "gives replayed: audit.json: tolerance is 1, expected at most"),
+        (lambda entry: stated(entry, asked_policy=None), "audit.json: asked_policy: policy is null, expected"),
+        (lambda entry: asked_of(entry, policy="stand"), 'asked_policy: policy is "stand", expected "expert"'),
+        (lambda entry: asked_of(entry, policy_file="0" * 12), "config.json: policy_file is null, of the policy itself"),
+        (lambda entry: asked_of(entry, labels="v4"), 'config.json: labels is "v3.1", of the policy itself "v4"'),
+        (
+            lambda entry: asked_of(entry, policy_facts={"privileged": True, "weights": "0" * 12}, code="0" * 12),
+            "config.json: policy_facts: privileged is null, of the policy itself true",
+        ),
         (lambda entry: stated(entry, asked="16"), 'audit.json: asked is "16", expected'),
         (lambda entry: stated(entry, played=[-1]), "audit.json: played is [-1], expected"),
         (lambda entry: (entry / "audit.json").write_text('{"run": 1}'), "expected an object of runs"),
         (lambda entry: (entry / "audit.json").write_text('{"run": {"tolerance": NaN}}'), "NaN is not JSON"),
         (lambda entry: (entry / "audit.json").write_bytes(b"\xff"), "not readable as JSON"),
     ],
-    ids="none head faults empty repeated picked few unpacked unasked part other lax text low shape nan raw".split(),
+    ids="none head faults empty repeated picked few unpacked unasked part other lax unnamed kind file labels facts "
+    "text low shape nan raw".split(),
 )
 def test_a_level_without_its_evidence_is_refused(audited, tmp_path, forge, named, capsys):
     """An entry that claims more than bundle and audit.json give is one line with file and field, code 2, no page."""
@@ -307,6 +352,12 @@ def test_a_level_without_its_evidence_is_refused(audited, tmp_path, forge, named
     forge(entry)
     code, said, site = build(entry, capsys)
     assert code == 2 and named in said and str(entry) in said.splitlines()[-1] and not site.exists(), said
+
+
+def asked_of(entry, **names):
+    """The policy that was asked is said to have other names."""
+    ((_, content),) = json.loads((entry / "audit.json").read_text()).items()
+    stated(entry, asked_policy=content["asked_policy"] | names)
 
 
 def few(entry):

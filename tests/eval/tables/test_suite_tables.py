@@ -433,3 +433,27 @@ def test_texts_of_numbers():
     assert points(-0.25) == "−25.0" and points(0.0) == points(-1e-9) == "0.0" and points(0.1) == "+10.0"
     assert interval_text(-0.004, 0.5) == "(0 to 50)" and interval_text(-0.31, 0.5) == "(−31 to 50)"
     assert probability(0.0004) == "<0.001" and probability(0.05) == "0.050" and probability(None) == ""
+
+
+def test_a_suite_claims_nothing_that_its_runs_contradict(tmp_path):
+    """Latency, labels, family, trackers and tasks of a training are the run's own, whatever suite.json says of them."""
+    facts = {"family": "act", "trackers": ["twist2"], "tasks": ["football"], "weights": "0123456789ab"}
+    trained = cell_of("act", "act", "twist2", "football")
+    expert = dataclasses.replace(cell_of("expert", "expert", "twist2", "boxing", trained_on=()), trained_tasks=())
+    folder = tmp_path / "suite"
+    write_suite(folder, [(trained, None), (expert, None)])
+    write_cell(folder / trained.folder, trained, outcomes(30), policy_facts=facts)
+    write_cell(folder / expert.folder, dataclasses.replace(expert, spec="expert"), outcomes(60))
+    honest = read_cells([folder]).cells
+    content = json.loads((folder / SUITE_FILE).read_text())
+    for cell in content["cells"]:
+        cell |= {"latency": 3, "labels": "v4", "family": "pi05", "replan": 2, "ensemble": True}
+        cell |= {"trained_on": ["sonic", "twist2"], "trained_tasks": ["football", "boxing"]}
+    (folder / SUITE_FILE).write_text(json.dumps(content))
+
+    def claims(cell):
+        kept = ("family", "trained_on", "trained_tasks", "labels", "latency", "replan", "ensemble")
+        return {name: getattr(cell, name) for name in kept}
+
+    assert [claims(cell) for cell in read_cells([folder]).cells] == [claims(cell) for cell in honest]
+    assert claims(honest[0])["trained_on"] == ("twist2",) and claims(honest[1])["trained_on"] == ()
