@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from arena_newton import tasks
 from arena_newton.cli.command_line import exit_code, program
-from arena_newton.cli.flags import parse_flags
+from arena_newton.cli.flags import Several, parse_flags
 from arena_newton.pages.tables import Table
 from arena_newton.robot.g1 import TWIST2_DRIVE, TWIST2_HUMANOIDARENA_DRIVE
 from arena_newton.rules.modes import BUILT_IN, DYNAMICS, QUANTITIES
@@ -210,9 +210,13 @@ def _departures() -> list[tuple[str, str, str]]:
     ]
 
 
-def markdown() -> str:
-    """The documentation page `docs/reference/rules.md`."""
-    sets = [get(name) for name in names()]
+def markdown(others: Sequence[str] = ()) -> str:
+    """The documentation page `docs/reference/rules.md`, with tasks of other packages where they are named.
+
+    Raises:
+        InputError: An unknown task.
+    """
+    sets = [get(name, others) for name in names()]
     specs = [tasks.get(t.task) for t in sets[0].tasks]
     items = [
         [cell.replace("|", "\\|") for cell in (item, first, "the same" if first == second else second)]
@@ -287,20 +291,24 @@ def markdown() -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class _NoFlags:
+class _Flags:
     """Print both rule sets as Markdown."""
+
+    task: Several[str] = ()
+    """Tasks of other packages, besides those of this one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the page `docs/reference/rules.md`.
 
     Returns:
-        Exit code: 0, or 2 for an argument, of which there are none.
+        Exit code: 0, or 2 for an unknown task or argument.
     """
 
     def work() -> None:
-        parse_flags(_NoFlags, list(sys.argv[1:] if argv is None else argv), program("rules", "arena_newton.rule_sets"))
-        print(markdown(), end="")
+        arguments = list(sys.argv[1:] if argv is None else argv)
+        flags = parse_flags(_Flags, arguments, program("rules", "arena_newton.rule_sets"))
+        print(markdown(flags.task), end="")
 
     return exit_code(work)
 

@@ -187,6 +187,8 @@ def push_bin(push_bin_site, tmp_path, monkeypatch):
     site = tmp_path / "site-packages"
     shutil.copytree(push_bin_site, site)
     monkeypatch.syspath_prepend(site)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "push_bin"]:
+        monkeypatch.delitem(sys.modules, name)  # of this environment's own, where it is installed
     yield site / "push_bin"
     for name in [name for name in sys.modules if name.partition(".")[0] == "push_bin"]:
         del sys.modules[name]
