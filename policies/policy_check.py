@@ -14,6 +14,7 @@ from typing import NoReturn
 from arena_newton import tasks
 from arena_newton.cli.command_line import exit_code, program
 from arena_newton.errors import InputError
+from arena_newton.policies import check_spec
 
 __all__ = ["main"]
 
@@ -37,6 +38,7 @@ def _parser() -> argparse.ArgumentParser:
 def _check(argv: Sequence[str]) -> int:
     args = _parser().parse_args(argv)
     tasks.get(args.task)
+    check_spec(args.spec)  # before the libraries are loaded
     if args.seeds is not None and (len(args.seeds) < 2 or len(set(args.seeds)) < len(args.seeds)):
         raise InputError(f"--seeds {' '.join(map(str, args.seeds))}: masks need at least 2 different ones")
 

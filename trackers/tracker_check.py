@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from arena_newton.cli.command_line import exit_code, program
 from arena_newton.errors import InputError
+from arena_newton.trackers import check_spec
 
 __all__ = ["main"]
 
@@ -42,6 +43,7 @@ def _check(argv: Sequence[str]) -> int:
     args = _parser().parse_args(argv)
     if args.worlds < 2:
         raise InputError(f"--worlds {args.worlds}: masks need at least 2")
+    check_spec(args.name)  # before the libraries are loaded
 
     from arena_newton.cli.quiet import quiet_warp
     from arena_newton.physics.devices import resolve_engine

@@ -126,6 +126,9 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
         if modes.get(mode).layers is not None and (layer := tasks.get(task).own_layer(mode)) is not None:
             factories.check_variant(layer, task)
     config = config.with_parts(made, policy)
+    for mode in config.flags.mode:
+        if not config.cameras and any(modes.get(mode).dynamics.get("picture_noise", ())):
+            raise InputError(f"--mode {mode}: picture_noise, but the policy wants no picture")
     late, chunk = config.flags.latency_ticks, getattr(policy, "chunk_size", 1)
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show
         raise InputError(f"--latency-ticks {late}: expected fewer ticks than the policy's chunk of {chunk} has")

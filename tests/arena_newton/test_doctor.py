@@ -2,6 +2,7 @@
 
 import importlib.util
 import runpy
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -104,6 +105,17 @@ def test_its_module_is_the_doctor(monkeypatch, capsys):
         with pytest.raises(SystemExit) as stopped:
             runpy.run_path(doctor.__file__, run_name="__main__")
         assert stopped.value.code == 2 and capsys.readouterr().err.startswith(f"error: {said}")
+
+
+def test_an_unknown_name_is_refused_at_once():
+    """A name that nobody offers is one line before torch and Warp are loaded, which takes seconds."""
+    code = (
+        "import sys\nfrom arena_newton.__main__ import main\n"
+        "print([main(['doctor', flag, 'nope']) for flag in ('--tracker', '--policy')])\n"
+        "print({'torch', 'warp', 'newton', 'mujoco'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500, cwd=ROOT)
+    assert done.stdout == "[2, 2]\nset()\n" and done.stderr.count("nope: unknown") == done.stderr.count("\n") == 2
 
 
 def test_a_strangers_tracker_by_name(installed_falcon, shared, capsys):

@@ -39,6 +39,7 @@ def run(out, *flags, **parts):
         (["--replan", "5", "--latency-ticks", "5"], "--latency-ticks 5: expected fewer ticks than --replan 5"),
         (["--ensemble", "--latency-ticks", "2"], "--latency-ticks 2: --ensemble queries every tick"),
         (["--replan", "5", "--policy", "remote:http://h:1"], "--replan: belongs to --policy lerobot:"),
+        (["--mode", "base", "base+picture_noise=2"], "picture_noise=2: picture_noise, but the policy wants no picture"),
     ],
 )
 def test_flags_that_contradict_are_refused(tmp_path, capsys, flags, says):
