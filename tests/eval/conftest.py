@@ -123,7 +123,7 @@ def boxed(watched_worlds):
 
 
 @pytest.fixture
-def push_bin():
+def push_crate():
     """Name of a registered task with an interaction, for which no saboteur and no seed was set."""
     import dataclasses
 
@@ -131,9 +131,9 @@ def push_bin():
 
     like = tasks.get("vis_navi")
     carried = dataclasses.replace(like.interaction, carried=True)
-    tasks.register(dataclasses.replace(like, name="push_bin", scene=like.layer, interaction=carried))
-    yield "push_bin"
-    tasks.unregister("push_bin")
+    tasks.register(dataclasses.replace(like, name="push_crate", scene=like.layer, interaction=carried))
+    yield "push_crate"
+    tasks.unregister("push_crate")
 
 
 @pytest.fixture

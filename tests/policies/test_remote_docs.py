@@ -75,7 +75,7 @@ def test_state_and_action_tables():
 
 def test_task_table():
     """Gym ids and instructions are the tasks' own."""
-    assert table("task") == [[name, tasks.get(name).gym_id, tasks.get(name).instruction] for name in tasks.names()]
+    assert table("task") == [[name, tasks.get(name).gym_id, tasks.get(name).instruction] for name in tasks.OWN]
 
 
 def test_numbers_in_the_text():

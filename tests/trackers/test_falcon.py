@@ -35,11 +35,6 @@ def test_registers(installed_falcon):
         trackers.get("falcon")
 
 
-def test_absent():
-    """Without the package the name is unknown."""
-    assert "falcon" not in trackers.names()
-
-
 def test_observation(installed_falcon, weights):
     """575 numbers: five frames, oldest first, terms in the order of their names; arms ride on the reference."""
     tracker = trackers.get("falcon", weights)

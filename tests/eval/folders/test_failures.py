@@ -87,12 +87,12 @@ def judged(outcome="timeout", startup_fall=False, steps=900, task="boxing", reas
         ("recovery", "timeout", {"moved": 0.9, "task": "open_door"}),
         ("approach", "timeout", {"task": "vis_navi"}),
         ("recovery", "timeout", {"moved": 0.4, "task": "vis_navi"}),
-        ("approach", "timeout", {"moved": 0.4, "task": "push_bin"}),
+        ("approach", "timeout", {"moved": 0.4, "task": "push_crate"}),
         ("tracking (legs)", "timeout", NOT_NEAR | {"tracking_error": 0.4, "tracking_worst": 0.6}),
         ("tracking (legs)", "fall", UNTOUCHED | {"tracking_error": 0.4, "tracking_worst": 0.6}),
     ],
 )
-def test_signals_name_a_stage(push_bin, stage, outcome, changes):
+def test_signals_name_a_stage(push_crate, stage, outcome, changes):
     """Each stage has its picture of signals, in tasks of other names by what their records declare."""
     assert stage_of(judged(outcome, **changes)) == stage
 
@@ -372,7 +372,7 @@ def test_the_check_fails_below_the_bar(capsys, monkeypatch, agreed):
     assert "1.00 rules with reader 2" in unlike.summary
 
 
-def test_the_check_plays_episodes_that_nothing_was_set_on(push_bin, agreed):
+def test_the_check_plays_episodes_that_nothing_was_set_on(push_crate, agreed):
     """Its group seeds lie above all that were looked at, whatever their number, and a note says both."""
     cells = []
 
@@ -384,9 +384,9 @@ def test_the_check_plays_episodes_that_nothing_was_set_on(push_bin, agreed):
     found = failures(SimpleNamespace(**context))
     scripted = [(task, name) for task in tasks.names() for name, one in SABOTAGES.items() if one.fits(task)]
     reached = [task for task in tasks.names() if (task, "clumsy") not in scripted]
-    assert reached == ["vis_navi", push_bin]
+    assert reached == ["vis_navi", push_crate]
     assert [(cell.task, cell.body) for cell in cells] == scripted
-    said = f"push_bin: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none"
+    said = f"push_crate: played from group seed {HELD_OUT} on; thresholds and saboteurs were set on none"
     assert said in " ".join(found.notes)
     for task, looked_at in TUNED.items():
         assert max(looked_at) < HELD_OUT

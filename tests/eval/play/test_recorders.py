@@ -146,7 +146,8 @@ def test_metrics_of_one_name_are_refused(tmp_path, capsys):
         recorders.unregister("ticks")
     assert main([*RUN, "--recorder", "nope", "--out", str(tmp_path / "b")]) == 2
     said = capsys.readouterr().err
-    assert "--recorder nope: unknown recorder; known are none: no package is installed that offers one" in said
+    known = ", ".join(recorders.names()) or "none: no package is installed that offers one"
+    assert f"--recorder nope: unknown recorder; known are {known}\n" in said
 
 
 def test_a_metric_that_two_recorders_give_is_refused(tmp_path, capsys):
