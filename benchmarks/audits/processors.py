@@ -26,7 +26,8 @@ __all__ = ["SETTINGS", "processor_figures"]
 
 ONE = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 WARP = "WARP_CPU_COMPILER_FLAGS"
-"""Stands for `warp.config.cpu_compiler_flags`, which Warp reads of no variable."""
+"""Stands for `warp.config.cpu_compiler_flags`, which Warp reads of no variable: flags of `clang -cc1`, which knows no
+`-march` but Warp's own `-march=native`."""
 PORTABLE = {"ATEN_CPU_CAPABILITY": "default", "MKL_CBWR": "COMPATIBLE", "ONEDNN_MAX_CPU_ISA": "SSE41"}
 PORTABLE |= {"OPENBLAS_CORETYPE": "Prescott", WARP: ""}
 SETTINGS: dict[str, dict[str, str]] = {
@@ -39,7 +40,7 @@ SETTINGS: dict[str, dict[str, str]] = {
     "oneDNN with SSE4.1": {"ONEDNN_MAX_CPU_ISA": "SSE41"},
     "NumPy of Haswell (AVX2)": {"OPENBLAS_CORETYPE": "Haswell"},
     "NumPy of Prescott (SSE3)": {"OPENBLAS_CORETYPE": "Prescott"},
-    "Warp for x86-64-v3 (AVX2, FMA)": {WARP: "-march=x86-64-v3"},
+    "Warp for x86-64-v3 (AVX2, FMA)": {WARP: "-target-cpu x86-64-v3"},
     "Warp for any x86-64": {WARP: ""},
     "C library without AVX2 and FMA": {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX512F"},
     "all of AVX2": {"ATEN_CPU_CAPABILITY": "avx2", "OPENBLAS_CORETYPE": "Haswell", "ONEDNN_MAX_CPU_ISA": "AVX2"},

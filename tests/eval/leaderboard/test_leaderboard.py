@@ -319,7 +319,7 @@ def test_a_level_is_what_the_evidence_gives(audited, tmp_path, capsys):
         (lambda entry: stated(entry, contradictions=["steps"]), "gives consistent: audit.json: contradictions: steps"),
         (lambda entry: stated(entry, played=[]), "gives consistent: audit.json: played is not all episodes"),
         (lambda entry: stated(entry, played=[0, 0]), "gives consistent: audit.json: played is not all episodes"),
-        (lambda entry: stated(entry, draw=7, played=[0, 1]), "played is not what draw 7 draws by the head"),
+        (lambda entry: picked(entry), "played is not what draw 7 draws by the head"),
         (lambda entry: few(entry), "gives consistent: audit.json: played is 2 episodes, expected at least 16"),
         (lambda entry: repacked(entry, actions_left_out), "gives consistent: bundle.zip: actions of episode "),
         (lambda entry: stated(entry, policy=None), "gives replayed: audit.json: asked is 16 of 16 episodes"),
@@ -366,6 +366,13 @@ def few(entry):
         archive.extractall(entry.parent / "run")
     (found,) = [folder_audit.audited(entry.parent / "run")]
     stated(entry, draw=7, played=[one.index for one in drawn(found, 2, 7)], asked=2)
+
+
+def picked(entry):
+    """Two episodes played again that the draw, which comes of the head and so of the code, did not choose."""
+    few(entry)
+    ((_, content),) = json.loads((entry / "audit.json").read_text()).items()
+    stated(entry, played=[number for number in range(16) if number not in content["played"]][:2])
 
 
 def actions_left_out(members):
