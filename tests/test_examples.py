@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from arena_newton import rule_sets
 from arena_newton.cli.extras import EXTRAS
 from arena_newton.eval.__main__ import main
 
@@ -138,14 +139,15 @@ def test_a_mode_of_a_package_is_studied_and_certified(installed, tmp_path, capsy
     assert moved in capsys.readouterr().out
 
 
-def test_packages_of_a_mode_a_metric_and_a_policy_play(installed, tmp_path, capsys):
-    """Installed, they are known by name: one run has all three, goes on, and is played again with its metric."""
-    for name in ("new_metric", "new_mode", "new_policy"):
+def test_packages_play_together(installed, tmp_path, capsys):
+    """Installed together, they are known by name; a run has four of them, goes on, and is played again as it was."""
+    for name in BARS:
         installed(ROOT / "examples" / name)
     out = tmp_path / "out"
-    names = "--mode base wet --recorder speed --policy wary".split()
-    assert main([str(out) if flag == "OUT" else flag for flag in RUN] + names) == 0
-    assert re.search(r"boxing \| twist2  \| wary   \| wet  \| highest_speed \| 1 \| 0\.\d+ ", capsys.readouterr().out)
+    names = "--task push_bin --mode base wet --recorder speed --policy wary".split()
+    assert main([str(out) if flag == "OUT" else flag for flag in RUN[2:]] + names) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"push_bin \| twist2  \| wary   \| wet  \| highest_speed \| 1 \| 0\.\d+ ", said)
     config = json.loads((out / "config.json").read_text())["config"]
     assert list(config["mode_facts"]) == ["wet"] and config["policy_facts"]["code"]
     assert main(["resume", str(out)]) == 0
@@ -154,14 +156,18 @@ def test_packages_of_a_mode_a_metric_and_a_policy_play(installed, tmp_path, caps
     assert lines.count('"highest_speed"') == 2
     assert main([*RUN, "--policy", "stand", "--recorder", "pace"]) == 2
     assert re.match("error: --recorder pace: unknown recorder; known are .*speed", capsys.readouterr().err)
+    assert rule_sets.main([]) == 0
+    assert capsys.readouterr().out == (ROOT / "docs" / "reference" / "rules.md").read_text(encoding="utf-8")
 
 
 def test_a_program_of_a_package_plays_by_its_command(installed, tmp_path, capsys):
-    """Installed, a program is a policy by its command; results know its code, and refuse to go on with another."""
+    """Installed, a program plays by its command, through another package's tracker; results know the program's code."""
+    installed(ROOT / "examples" / "new_tracker")
     code = installed(ROOT / "examples" / "new_program") / "squat_program.py"
-    run = [*RUN[:-1], str(tmp_path / "out"), "--policy", "process:squat"]
+    names = {"twist2": "homing:0.5", "OUT": str(tmp_path / "out")}
+    run = [*(names.get(flag, flag) for flag in RUN), "--policy", "process:squat"]
     assert main(run) == 0
-    assert "| boxing | twist2  | process:squat | base |" in capsys.readouterr().out
+    assert "| boxing | homing:0.5 | process:squat | base |" in capsys.readouterr().out
     facts = json.loads((tmp_path / "out" / "config.json").read_text())["config"]["policy_facts"]
     assert facts["command"] == "squat" and re.fullmatch("squat [0-9a-f]{8}", facts["server"])
     assert not facts["worlds_matter"]
