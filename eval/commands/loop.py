@@ -15,10 +15,11 @@ __all__ = ["run"]
 
 def run(options: LoopOptions, factories: Factories | None = None) -> int:
     """Run the loop; missing libraries are named before those that are there load."""
-    from arena_newton.eval.loop.loop_requirements import check_libraries
+    from arena_newton.eval.loop.loop_requirements import check_libraries, plan_path
 
     check_libraries(options.policy)
     if options.plan is not None:
+        plan_path(options.plan)  # a wrong name is refused before torch is loaded
         from arena_newton.eval.loop import plan_loop
 
         return plan_loop.run(options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,10 @@ from arena_newton.cli.extras import require
 from arena_newton.errors import InputError
 from arena_newton.policies.recipes.training_recipe import FAMILIES
 
-__all__ = ["check_disk", "check_folder", "check_libraries", "recorded_bytes"]
+__all__ = ["SHIPPED", "check_disk", "check_folder", "check_libraries", "plan_path", "recorded_bytes"]
+
+SHIPPED = Path(__file__).resolve().parent
+"""Folder of the plans that come with the package."""
 
 TICK_BYTES = 2_500
 """A recorded tick with its picture of 224x224, and the same in the dataset [bytes]; 1,800 and 700 were measured."""
@@ -32,6 +36,22 @@ def check_libraries(family: str) -> None:
     require("data", "eval loop")
     if family in FAMILIES and family != "act":
         require("policies", f"eval loop --policy {family}")
+
+
+def plan_path(given: str) -> Path:
+    """File of a plan: that file, or the one of a plan that comes with the package.
+
+    Raises:
+        InputError: There is none.
+    """
+    path = Path(given).expanduser()
+    if not path.is_file() and re.fullmatch(r"[a-z0-9_]+", given):
+        path = SHIPPED / f"{given}.toml"
+    if not path.is_file():
+        known = " ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
+        found = "is a folder, expected a file" if path.is_dir() else "no such file"
+        raise InputError(f"--plan {given}: {found}; the package brings the plans {known}")
+    return path
 
 
 def check_folder(out: Path) -> None:

@@ -69,10 +69,9 @@ class PlanFolders:
         """Tables of all suites."""
         return self.out / "tables"
 
-    @property
-    def packed(self) -> Path:
-        """The packed policy of the first row."""
-        return self.out / "packed"
+    def packed(self, row: PlanRow) -> Path:
+        """The packed policy of a row."""
+        return self.out / "packed" / row.name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +112,7 @@ def plan_commands(
 
     Args:
         plan: The plan.
-        rows: Its rows that are trained.
+        rows: Its rows that are trained; the first one's policy is packed.
         seeds: Seeds of the trainings of each row.
         device: Device of all commands; None: the best there is.
         minutes: Time of a training that begins now [min].
@@ -160,8 +159,8 @@ def plan_commands(
             after=tuple(f"evaluate {row.name}" for row in rows),
         )
     )
-    first = plan.rows[0]
-    if first in rows and first.train.policy == "act":  # other families are not packed
+    first = rows[0]
+    if first.train.policy == "act":  # other families are not packed
         card = partial(_packed, plan, folders, first, middle)
         found.append(PlanCommand(stage="card", name=first.name, words=card, after=("tables",)))
     return found
@@ -260,7 +259,8 @@ def _packed(
     """Pack a training; cells whose budgets were cut are no results, and are not in its card."""
     suites = folders.suites(row)
     seed, others = middle(suites)
-    words = [EVAL, "pack", str(folders.training(row, seed)), "--out", str(folders.packed), "--tasks", *plan.attempts]
+    training, out = str(folders.training(row, seed)), str(folders.packed(row))
+    words = [EVAL, "pack", training, "--out", out, "--tasks", *plan.attempts]
     for flag, some in () if plan.evaluate.get("max_steps") else (("--results", suites), ("--trainings", others)):
         words += [flag, *map(str, some)] if some else []
     return words

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from arena_newton.cli.flags import parse_flags, typed
 from arena_newton.errors import InputError
+from arena_newton.eval.loop.loop_requirements import plan_path
 from arena_newton.eval.plan.config import recording_run, resolve
 from arena_newton.eval.plan.options import RecordOptions
 from arena_newton.eval.suites.matrix_cells import expand_cells
@@ -26,8 +27,6 @@ from arena_newton.policies.train.policy_options import PolicyTrainOptions, check
 
 __all__ = ["LoopPlan", "PlanRow", "PlanSettings", "policy_name", "read_plan", "suite_text"]
 
-SHIPPED = Path(__file__).resolve().parent
-"""Folder of the plans that come with the package."""
 TABLES = ("name", "plan", "record", "attempts", "parts", "train", "rows", "evaluate", "bars", "best")
 OF_ROW = ("name", "trackers", "modes")
 """Keys of [[rows]] that are no flags of a training."""
@@ -122,13 +121,7 @@ def read_plan(given: str) -> LoopPlan:
     Raises:
         InputError: There is none, or a table, key or value is unfit; the message names file and table.
     """
-    path = Path(given).expanduser()
-    if not path.is_file() and re.fullmatch(r"[a-z0-9_]+", given):
-        path = SHIPPED / f"{given}.toml"
-    if not path.is_file():
-        known = " ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
-        found = "is a folder, expected a file" if path.is_dir() else "no such file"
-        raise InputError(f"--plan {given}: {found}; the package brings the plans {known}")
+    path = plan_path(given)
     content, _ = read_toml(path)
     for key in content:
         if key not in TABLES:

@@ -69,7 +69,7 @@ def suite_tables(cells: Sequence[EvaluatedCell], paper: PaperNumbers, changed: S
     prompt = [cell for cell in cells if cell.latency == 0]
     modes = ordered({c.mode for c in prompt}, MODE_ORDER)
     found: list[SuiteTable | None] = [_in_gmt(prompt, paper, mode) for mode in modes]
-    found += [_untrained(prompt, mode) for mode in modes]
+    found += [table(prompt, mode) for table in (_merged, _untrained) for mode in modes]
     found += [
         trainings_table(prompt),
         _best(prompt, paper),
@@ -216,24 +216,36 @@ def _reported(paper: PaperNumbers) -> str:
 def _untrained(cells: Sequence[EvaluatedCell], mode: str) -> SuiteTable | None:
     """Policies without training, such as the expert, which no tracker is the own one of."""
     mine = [cell for cell in cells if cell.mode == mode and not cell.trained_on]
-    if not mine:
+    about = "Policies that were not trained, or do not say on what."
+    return _by_tracker(mine, mode, "untrained", "Policies without training", about)
+
+
+def _merged(cells: Sequence[EvaluatedCell], mode: str) -> SuiteTable | None:
+    """Policies of merged demonstrations through each tracker, also those that none of these were recorded through."""
+    mine = [cell for cell in cells if cell.mode == mode and cell.trained_on and cell.merged]
+    about = "Policies of the demonstrations of several tasks or trackers, through each tracker by itself."
+    return _by_tracker(mine, mode, "merged", "Merged training by tracker", about)
+
+
+def _by_tracker(cells: Sequence[EvaluatedCell], mode: str, kind: str, title: str, about: str) -> SuiteTable | None:
+    """Rates of each policy through each tracker in a mode."""
+    if not cells:
         return None
-    name = "untrained" if mode == "base" else f"untrained_{mode}"
-    columns = _rate_columns(mine)
+    name = kind if mode == "base" else f"{kind}_{mode}"
+    columns = _rate_columns(cells)
     rows: list[tuple[str, ...]] = []
     entries: list[TableEntry] = []
     groups = []
-    for tracker in tracker_order({cell.tracker for cell in mine}):
+    for tracker in tracker_order({cell.tracker for cell in cells}):
         groups.append(len(rows))
-        here = [cell for cell in mine if cell.tracker == tracker]
+        here = [cell for cell in cells if cell.tracker == tracker]
         for policy, family in _policies(here):
             texts, found = _rate_row(name, [c for c in here if (c.policy, c.family) == (policy, family)], columns)
             rows.append((tracker, policy, *texts))
             entries += found
-    title = "Policies without training" + ("" if mode == "base" else f", mode {mode}")
     head = ("tracker", "policy", "n", "AFR", *(SHORT.get(c, task_title(c)) + _change(mode, c) for c in columns))
-    caption = f"Policies that were not trained, or do not say on what. {OURS}{_about(mode)}"
-    return SuiteTable(head, rows, "llr", title, caption, name, groups, entries)
+    named = title + ("" if mode == "base" else f", mode {mode}")
+    return SuiteTable(head, rows, "llr", named, f"{about} {OURS}{_about(mode)}", name, groups, entries)
 
 
 def _best(cells: Sequence[EvaluatedCell], paper: PaperNumbers) -> SuiteTable | None:

@@ -1,13 +1,17 @@
 """Plans of `eval loop --plan`: what their tables say, what is refused, and the commands that are made of them."""
 
+import subprocess
+import sys
+
 import pytest
 from made_suites import cell_of, outcomes, write_suite
 
 from arena_newton.errors import InputError
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.loop import plan_report
-from arena_newton.eval.loop.plan_commands import PlanFolders, plan_commands
-from arena_newton.eval.loop.plan_file import SHIPPED, read_plan, suite_text
+from arena_newton.eval.loop.loop_requirements import SHIPPED
+from arena_newton.eval.loop.plan_commands import ALL_GPUS, PlanFolders, plan_commands
+from arena_newton.eval.loop.plan_file import read_plan, suite_text
 from arena_newton.eval.loop.plan_loop import training_minutes
 from arena_newton.eval.suites.matrix_cells import expand_cells
 from arena_newton.eval.suites.suite_file import read_suite_file
@@ -27,10 +31,10 @@ def cells_of(plan, name, tmp_path):
 
 
 def test_the_generalist_plays_every_cell(tmp_path):
-    """Three trainings on 14 pairs in six modes; a network of one tracker is swapped in base mode alone."""
+    """Three trainings on 14 pairs in seven modes; a network of one tracker is swapped in base mode alone."""
     plan = read_plan("generalist")
     cells = cells_of(plan, "all", tmp_path)
-    assert len(cells) == 3 * 14 * 6 and {cell.episodes for cell in cells} == {60}
+    assert len(cells) == 3 * 14 * 7 and {cell.episodes for cell in cells} == {60}
     assert {cell.policy for cell in cells} == {"all#1", "all#2", "all#3"}
     assert {(cell.tracker, cell.mode) for cell in cells_of(plan, "twist2", tmp_path)} == {
         ("twist2", "base"),
@@ -50,7 +54,12 @@ def test_rows_of_the_generalist_are_its_ablation():
     }
     expected = {"none": {"looks", "look_changes", "recipe_values"}, "augmentation": {"looks", "look_changes"}}
     expected |= {name: {"look_changes"} for name in ("shapes", "light", "keys-seldom")}
-    expected |= {"plain-02": {"looks"}, "plain-06": {"looks"}, "untold": {"tracker_vector"}}
+    expected |= {
+        "goals": {"looks", "look_changes"},
+        "plain-02": {"looks"},
+        "plain-06": {"looks"},
+        "untold": {"tracker_vector"},
+    }
     assert differ == expected | {"twist2": set(), "sonic": set()}
 
 
@@ -66,8 +75,8 @@ def test_commands_are_those_of_the_house(tmp_path):
     one = commands["record double_desk_sonic_2"]
     text = " ".join(one.words())
     assert text.startswith("arena_newton.eval record --task double_desk --tracker sonic ")
-    assert "--episodes 180" in text and "--worlds 90" in text and "--shard 2/2" in text and "--looks 1" in text
-    assert one.size == 180 * 2000 / 2
+    assert "--episodes 130" in text and "--worlds 65" in text and "--shard 2/2" in text and "--looks 1" in text
+    assert one.size == 130 * 2000 / 2
     assert commands["build double_desk_sonic"].after == ("record double_desk_sonic_1", "record double_desk_sonic_2")
     train = commands["train all_2"]
     text = " ".join(train.words())
@@ -97,13 +106,15 @@ def test_what_is_there_is_continued(tmp_path):
 
 
 def test_several_gpus_train_one_network(tmp_path):
-    """By torchrun where the plan gives a training several, as many as there are."""
-    text = (SHIPPED / "generalist.toml").read_text()
-    (tmp_path / "two.toml").write_text(text)
-    plan = read_plan(str(tmp_path / "two.toml"))
-    words = made(plan, tmp_path)["train all_1"].words()
-    assert words[:5] == ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
-    assert made(plan, tmp_path, gpus=1)["train all_1"].words()[0] == "arena_newton.policies.train"
+    """By torchrun where the plan gives a training several, as many as there are; on one GPU or none in one process."""
+    plan = read_plan("generalist")
+    for gpus, taken in ((4, 2), (2, 2), (1, 1), (0, 1)):
+        train = made(plan, tmp_path, gpus=gpus)["train all_1"]
+        words = list(train.words())
+        begins = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"] if taken == 2 else []
+        assert train.gpus == taken and words[: len(begins) + 1] == [*begins, "arena_newton.policies.train"]
+        assert words[words.index("--batch-size") + 1] == "128"
+        assert made(plan, tmp_path, gpus=gpus)["evaluate all"].gpus == ALL_GPUS
 
 
 def test_trainings_have_the_time_that_recording_leaves(tmp_path):
@@ -182,6 +193,13 @@ def test_unfit_flags_of_a_plan_are_refused(tmp_path, capsys, flags, says):
     assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+def test_a_wrong_name_is_refused_at_once():
+    """Before torch is loaded, which takes seconds."""
+    code = "import sys\nfrom arena_newton.eval.__main__ import main\nprint(main(sys.argv[1:]), 'torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, "loop", "--plan", "nope"], capture_output=True, text=True)
+    assert done.stdout == "2 False\n" and done.stderr.startswith("error: --plan nope: no such file"), done.stderr
+
+
 def test_a_folder_is_of_one_plan(tmp_path, capsys):
     """A stage without those before it, another plan, and a folder of something else are refused."""
     flags = ["loop", "--plan", "tiny", "--device", "cpu", "--out", str(tmp_path / "out")]
@@ -202,7 +220,7 @@ def test_the_page_has_the_middle_of_the_trainings_and_their_bars(tmp_path):
     cells = []
     for seed, won in ((1, 60), (2, 50), (3, 57)):
         for tracker, less in (("twist2", 0), ("sonic", 7)):
-            for mode in ("base", "visual"):
+            for mode in ("base", "visual", "dynamics"):
                 cell = cell_of(f"all#{seed}", "act", tracker, "boxing", trained_on=("twist2", "sonic"), mode=mode)
                 cells.append((cell, outcomes(won - less)))
     write_suite(folders.suite(plan.rows[0]), cells)
@@ -210,10 +228,14 @@ def test_the_page_has_the_middle_of_the_trainings_and_their_bars(tmp_path):
     said = plan_report.write(plan, folders, [], "a command")
     assert "all: base: 107 of 120 (113 93 107) missed" in said and "all: visual: 107 of 120 (113 93 107) missed" in said
     assert "all: under its bar: boxing sonic base: 50 of 60, bar 54" in said
-    assert not any("visual: 50" in line or "twist2" in line for line in said)
-    assert made(plan, tmp_path)["card all"].words()[3:5] == ["--out", str(tmp_path / "packed")]
+    assert "all: dynamics: 107 of 120 (113 93 107)" in said  # no bar, no verdict
+    assert not any("visual: 50" in line or "dynamics: 50" in line or "twist2" in line for line in said)
+    assert made(plan, tmp_path)["card all"].words()[3:5] == ["--out", str(tmp_path / "packed" / "all")]
+    assert made(plan, tmp_path, rows=[plan.row("goals")])["card goals"].words()[2] == str(
+        tmp_path / "trainings/goals_2"
+    )
     page = (tmp_path / "plan.md").read_text()
-    assert "| boxing | twist2 | 60 50 57 | 60 50 57 |" in page and "Seeds of its trainings: 1 2 3." in page
+    assert "| boxing | twist2 | 60 50 57 | 60 50 57 | 60 50 57 |" in page and "Seeds of its trainings: 1 2 3." in page
 
 
 def test_trainings_of_several_machines_have_one_page(tmp_path):

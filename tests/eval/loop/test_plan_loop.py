@@ -6,7 +6,7 @@ import pytest
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.loop import plan_run
-from arena_newton.eval.loop.plan_file import SHIPPED
+from arena_newton.eval.loop.loop_requirements import SHIPPED
 from arena_newton.eval.loop.plan_run import command_times
 from arena_newton.eval.suites.suite_records import read_suite
 from arena_newton.policies.learned.learned_card import read_card
@@ -62,7 +62,7 @@ def test_a_plan_goes_on_from_stage_to_stage(plan, monkeypatch, capsys):
 
     monkeypatch.setattr(Forked, "instead", {"arena_newton.policies.train": "tests.eval.loop.killed_training"})
     assert main(flags) == 1
-    assert "failed: train all_1: SIGKILL" in capsys.readouterr().out and not (out / "packed").exists()
+    assert "failed: train all_1: SIGKILL" in capsys.readouterr().out and not (out / "packed" / "all").exists()
     assert (out / "trainings" / "all_1" / "checkpoints" / "last").resolve().name == "000002"
 
     monkeypatch.setattr(Forked, "instead", {})
@@ -75,7 +75,7 @@ def test_a_plan_goes_on_from_stage_to_stage(plan, monkeypatch, capsys):
         ("all#1", "base", "done"),
         ("all#1", "visual", "done"),
     }
-    card = read_card(out / "packed")
+    card = read_card(out / "packed" / "all")
     assert (card.tasks, card.seed, card.steps, card.looks) == (("boxing",), 1, 4, ("0.5",))
     assert (out / "tables" / "cells.csv").is_file()
     assert "Failures of all trainings by stage" in (out / "plan.md").read_text()

@@ -50,8 +50,8 @@ def row(table, *start):
 
 def test_every_kind_of_table_is_made(tables):
     """All tables that the cells can fill are there, and each row has a text for each column."""
-    names = "in_gmt in_gmt_visual in_gmt_semantic untrained best families perturbation cross_gmt merge_all latency"
-    assert list(tables) == [*names.split(), "labels", "cost"]
+    names = "in_gmt in_gmt_visual in_gmt_semantic merged untrained best families perturbation cross_gmt merge_all"
+    assert list(tables) == [*names.split(), "latency", "labels", "cost"]
     for table in tables.values():
         assert all(len(r) == len(table.head) for r in table.rows)
         assert all(group < len(table.rows) for group in table.groups)
@@ -206,6 +206,18 @@ def test_merged_training_pools_both_trackers(tables):
     assert shown["n"] == "120" and shown["Football"].startswith("50.0 ± 50.0 (")
     theirs = row(tables["merge_all"], "TWIST2+SONIC ×14", "ACT", "paper")
     assert theirs["Football"].startswith("32.5 ± 18.4") and theirs["n"] == "100 to 120"
+
+
+def test_merged_training_has_each_tracker_and_mode(tables, cells):
+    """A policy of many tasks has a number for each of its cells, in every mode; a swapped one too."""
+    rates = [row(tables["merged"], tracker, "all")["Football"] for tracker in ("twist2", "sonic")]
+    assert [rate.split(" ")[0] for rate in rates] == ["33.3", "66.7"]
+    merged = [cell for cell in cells.cells if cell.merged]
+    assert len([e for e in tables["merged"].entries if e.task != "HOI_AVG"]) == len(merged) == 6
+    others = [dataclasses.replace(cell, mode="dynamics") for cell in merged]
+    others += [dataclasses.replace(cell, policy="one", trained_on=("twist2",)) for cell in merged]
+    found = {table.name: table for table in suite_tables(others, paper_numbers())}
+    assert row(found["merged_dynamics"], "sonic", "all")["n"] == row(found["merged"], "sonic", "one")["n"] == "60"
 
 
 def test_latency_and_labels(tables):
@@ -397,7 +409,7 @@ def test_latex_is_whole(suite, tmp_path):
     """The document of all tables closes what it opens and has a text for every column; where LaTeX is, it compiles."""
     assert main(["tables", str(suite), "--out", str(tmp_path), "--format", "tex"]) == 0
     text = (tmp_path / "tables.tex").read_text()
-    assert balanced(text) == [] and text.count(r"\toprule") == 12
+    assert balanced(text) == [] and text.count(r"\toprule") == 13
     assert balanced(text.replace(r"\bottomrule", r"\begin{x}", 1)) != []
     if shutil.which("pdflatex"):
         command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "tables.tex"]
