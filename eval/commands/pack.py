@@ -37,7 +37,8 @@ class PackOptions:
     """Folder to write; that of the policy that comes with the package when none is named."""
     tasks: Several[str] = ()
     """Tasks that it is offered for, in the order in which it plays them; with results those that it solves at
-    75 % in mode base through every tracker of its training, otherwise those of its training."""
+    75 % in mode base through every tracker of its training, otherwise those of its training, and of a packed policy
+    that is packed again those it was offered for."""
     results: Several[str] = ()
     """Results folders or suites of eval whose cells of this checkpoint go into the card; a packed policy that is
     packed again keeps its other cells."""
@@ -76,7 +77,8 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     others = _trainings([Path(name).expanduser() for name in options.trainings], facts, digests)
     # Of equally good tasks the first stays the first.
     trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
-    chosen = options.tasks or (_solved(found, trained, facts.trackers) if found else trained)
+    again = before.tasks if before is not None and not options.results else ()  # nothing new is known of them
+    chosen = options.tasks or again or (_solved(found, trained, facts.trackers) if found else trained)
     for task in chosen:
         if task not in tasks.names():
             known = f"choose from {', '.join(tasks.names())}"

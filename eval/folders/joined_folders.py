@@ -31,7 +31,8 @@ class JoinedFolders(ResultsFolder):
         episodes = tuple(dataclasses.replace(episode, index=number) for number, episode in enumerate(planned))
         modes = tuple(part.config.flags.mode[0] for part in parts)
         flags = dataclasses.replace(first.flags, mode=modes)
-        config = dataclasses.replace(first, flags=flags, episodes=episodes, planned=len(episodes))
+        facts = {name: one for part in parts for name, one in part.config.mode_facts.items()}
+        config = dataclasses.replace(first, flags=flags, episodes=episodes, planned=len(episodes), mode_facts=facts)
         super().__init__(parts[0].path, config, parts[0].installed)
         self._parts, self._by_mode = tuple(parts), dict(zip(modes, parts, strict=True))
 

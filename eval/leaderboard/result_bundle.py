@@ -31,7 +31,7 @@ __all__ = ["MAX_BUNDLE_BYTES", "made_bundle", "strays", "strips_of", "unpack"]
 MAX_BUNDLE_BYTES = 64 << 20
 MAX_UNPACKED_BYTES = 512 << 20
 MAX_FILES = 10_000
-_WORD = r"[A-Za-z0-9_+][A-Za-z0-9_.+=-]{0,199}"
+_WORD = r"[A-Za-z0-9_+][A-Za-z0-9_.+=#-]{0,199}"
 _MEMBER = re.compile(
     rf"(?:{_WORD}/){{0,4}}(?:config\.json|episodes\.jsonl|suite\.json|suite\.{_WORD}\.jsonl"
     rf"|actions/(?:{_WORD}/)?{_WORD}\.npz|strips/{_WORD}\.(?:jpg|png))"
@@ -77,7 +77,7 @@ def made_bundle(
             data = _by_columns(path, data) if path in columns else data
             size += len(data)
             if not _MEMBER.fullmatch(name):
-                raise InputError(f"{path}: a bundle holds plain names of letters, digits and _ . + = - alone")
+                raise InputError(f"{path}: a bundle holds plain names of letters, digits and _ . + = # - alone")
             member = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
             member.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(member, data)

@@ -57,6 +57,13 @@ def announce(config: RunConfig, folder: Path, waiting: Mapping[tuple[str, str, s
             f"  the policy server does not declare that it honours seeds: if it draws random numbers, results "
             f"depend on --worlds {flags.worlds} and on timing; --worlds 1 is reproducible"
         )
+    known = (config.policy_facts or {}).get("trackers") or []  # of its training, where it says them
+    foreign = [name for name in flags.tracker if name not in known]
+    if isinstance(known, list) and known and foreign:
+        trained = plain_text(" ".join(map(str, known)), 200)
+        print(
+            f"  policy {config.policy_label} was trained through {trained}, and is played through {' '.join(foreign)}"
+        )
     if "pd" in flags.tracker:
         print("  --tracker pd cannot balance: expect falls; for an evaluation: --tracker twist2")
 

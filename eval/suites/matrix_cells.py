@@ -22,6 +22,7 @@ from arena_newton.eval.suites.suite_records import SuiteCell
 from arena_newton.files.stored_json import MAX_NAME, JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table
+from arena_newton.policies.learned import learned_card
 from arena_newton.policies.lerobot.checkpoint_facts import CONFIG_FILE, CheckpointFacts, checkpoint_folder
 
 __all__ = [
@@ -39,8 +40,8 @@ MAX_CELLS = 20_000
 """Cells of one suite; the paper's largest table has a few hundred."""
 LATER_FLAGS = {"latency": "latency_ticks", "replan": "replan", "ensemble": "ensemble"}
 """Field of a cell → flag of `eval run`."""
-CHECKPOINTS = "lerobot"
-"""Policies whose spec names a checkpoint."""
+CHECKPOINTS, PACKED = "lerobot", "learned"
+"""Policies whose spec names a checkpoint, or a packed one; without a name the one that comes with the package."""
 
 
 def expand_cells(suite: SuiteFile) -> list[SuiteCell]:
@@ -110,7 +111,7 @@ def _cell(
     return SuiteCell(
         id=name,
         policy=entry.name,
-        family=entry.family or ("" if scheme in (CHECKPOINTS, "process", "remote") else scheme),
+        family=entry.family or ("" if scheme in (CHECKPOINTS, PACKED, "process", "remote") else scheme),
         spec=spec,
         trained_on=trained_on,
         trained_tasks=learned,
@@ -268,9 +269,11 @@ def _described(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, t
     """
     policies.check_spec(spec)
     scheme, _, argument = spec.partition(":")
-    if scheme != CHECKPOINTS or entry.hub:
+    if scheme not in (CHECKPOINTS, PACKED) or entry.hub:
         return None, (None, None)
-    folder = _checkpoint(argument)
+    folder = learned_card.SHIPPED if spec == PACKED else _checkpoint(scheme, argument)
+    if spec == PACKED and not folder.is_dir():
+        raise InputError(learned_card.NOT_SHIPPED)
     path = folder / CONFIG_FILE
     try:
         config = parse(read_regular(path.resolve(), MAX_CONFIG_BYTES))
@@ -283,20 +286,20 @@ def _described(spec: str, entry: PolicyEntry) -> tuple[CheckpointFacts | None, t
     return CheckpointFacts.read(folder), (sizes[0], sizes[1])
 
 
-def _checkpoint(argument: str) -> Path:
+def _checkpoint(scheme: str, argument: str) -> Path:
     """Folder of a checkpoint that has weights."""
     if not argument:
-        raise InputError("spec lerobot: names no checkpoint, expected lerobot:<folder>")
-    folder = checkpoint_folder(Path(argument).expanduser(), "spec lerobot")
+        raise InputError(f"spec {scheme}: names no checkpoint, expected {scheme}:<folder>")
+    folder = checkpoint_folder(Path(argument).expanduser(), f"spec {scheme}")
     if not any(folder.glob("*.safetensors")):
-        raise InputError(f"spec lerobot:{argument}: {folder} holds no weights (no .safetensors)")
+        raise InputError(f"spec {scheme}:{argument}: {folder} holds no weights (no .safetensors)")
     return folder
 
 
 def _with_facts(where: str, cell: SuiteCell, entry: PolicyEntry, facts: CheckpointFacts) -> SuiteCell:
     """A cell held to what its checkpoint says of its training."""
     names = {spec.gym_id: spec.name for spec in tasks.specs()}
-    learned, path = tuple(names.get(task, task) for task in facts.tasks), cell.spec.partition(":")[2]
+    learned, path = tuple(names.get(task, task) for task in facts.tasks), cell.spec.partition(":")[2] or cell.spec
     claims = (
         ("labels", (entry.labels,) if entry.labels else (), (facts.labels,)),
         ("family", (entry.family,) if entry.family else (), (facts.family,) if facts.family else ()),

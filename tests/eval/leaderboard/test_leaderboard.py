@@ -105,6 +105,16 @@ def test_an_entry_of_a_run_is_checked_and_shown(made, entry, capsys):
     assert "holds an entry of other runs already" in capsys.readouterr().err
 
 
+def test_a_suite_of_numbered_trainings_is_bundled(made, tmp_path, capsys):
+    """Cells of a plan's suite have the number of their training in their folder, as `all#1.twist2+sonic`."""
+    cell = tmp_path / "suite" / "all#1.twist2+sonic" / "twist2"
+    shutil.copytree(made.parent / "run", cell)
+    assert main(["bundle", str(tmp_path / "suite"), "--out", str(tmp_path / "entry")]) == 0
+    fill(tmp_path / "entry", **KEYS)
+    code, said, _ = build(tmp_path / "entry", capsys)
+    assert code == 0 and "consistent, 4 rates" in said, said
+
+
 def filmed(run):
     """Give the run's lines strips and signals of failures, links and tables."""
     members = {"episodes.jsonl": (run / "episodes.jsonl").read_bytes()}

@@ -98,6 +98,19 @@ def test_the_default_run_has_a_row_that_sees(default_run, shipped, capsys):
     assert results["config"]["policy_facts"]["weights"] == read_card(shipped).weights and results["complete"]
 
 
+def test_a_run_names_the_trackers_of_its_training(shipped, tmp_path, capsys):
+    """Through another tracker a trained policy says which it knows, besides that `pd` cannot balance."""
+    flags = ["--task", "vis_navi", "--policy", "learned", "--seeds", "0", "--repeats", "1", "--device", "cpu"]
+    assert main([*flags, "--tracker", "twist2", "pd", "--out", str(tmp_path / "both")], stand_ins()) == 0
+    said = capsys.readouterr().out
+    assert (
+        "policy learned was trained through sonic twist2, and is played through pd\n" in said
+        and "cannot balance" in said
+    )
+    assert main([*flags, "--tracker", "twist2", "--out", str(tmp_path / "one")], stand_ins()) == 0
+    assert "was trained through" not in capsys.readouterr().out
+
+
 def test_a_learned_run_that_was_interrupted_is_resumed(shipped, tmp_path, capsys, monkeypatch):
     """Ctrl-C in the second run keeps the experts' report; the second goes on by its own resume."""
     act = FakePolicy.act
@@ -195,6 +208,8 @@ def test_pack_reads_what_the_policy_reached(tmp_path, capsys):
     assert (again.note, set(again.results), again.tasks) == ("Made for a test.", set(card.results), ("boxing",))
     assert [(one.task, one.mode) for one in again.results][:2] == [("boxing", "base"), ("boxing", "visual")]
     assert again.packed_by.startswith(card.packed_by + "; then python -m arena_newton.eval pack packed --tasks")
+    assert main(["pack", str(out), "--out", str(out)]) == 0
+    assert read_card(out).tasks == ("boxing",), "without new results a policy stays offered for what it was"
     other = checkpoint(tmp_path / "other", tasks=("vis_navi", "boxing"))
     capsys.readouterr()
     weights = (other / "model.safetensors").read_bytes()

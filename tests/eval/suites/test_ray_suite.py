@@ -172,6 +172,19 @@ def test_the_same_bytes_as_without(undisturbed, alone, tmp_path):
         assert mine.wall_s > 0 and load_cell(found, mine).document["status"]["state"] == "success"
 
 
+def test_modes_with_facts_of_their_own_play_in_one_batch(inline, suite, tmp_path):
+    """Processes take cells that play at once by the ranges of all their modes: those of `dynamics` beside `base`."""
+    text = suite.read_text()
+    assert 'modes = ["base", "visual"]' in text
+    suite.write_text(text.replace('modes = ["base", "visual"]', 'modes = ["base", "dynamics"]'))
+    inline()
+    assert call(suite, tmp_path / "out", by=JOBS) == 0
+    assert {(cell.mode, cell.status) for cell in read_suite(tmp_path / "out").cells} == {
+        ("base", "done"),
+        ("dynamics", "done"),
+    }
+
+
 def test_one_crew_for_all_cells(undisturbed):
     """Processes are asked for once; cells are opened by who plays them; who is free before the end helps another.
 

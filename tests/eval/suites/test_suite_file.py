@@ -22,6 +22,7 @@ from arena_newton.eval.suites.suite_records import (
 )
 from arena_newton.policies.base import POLICIES
 from arena_newton.policies.chunk_flags import LABELS as KNOWN_LABELS
+from arena_newton.policies.learned.learned_card import SHIPPED as SHIPPED_POLICY
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from tests.fuzz.mutants import damaged
 
@@ -250,6 +251,23 @@ def test_a_checkpoint_without_weights_is_refused(checkpoints, tmp_path):
     """A folder with a configuration alone is no checkpoint."""
     (tmp_path / "both/checkpoints/last/pretrained_model/model.safetensors").unlink()
     with pytest.raises(InputError, match="holds no weights"):
+        learned(checkpoints)
+
+
+def test_packed_policies_say_what_they_are_too(checkpoints, tmp_path):
+    """`learned`, and `learned:<folder>`, count as trained: family, labels, trackers and tasks are from their facts."""
+    packed = tmp_path / "both/checkpoints/last/pretrained_model"
+    for spec in ("learned", f"learned:{packed}"):
+        facts = CheckpointFacts.read(SHIPPED_POLICY if spec == "learned" else packed)
+        text = f'[matrix]\ntasks = ["vis_navi"]\n[[policies]]\nname = "one"\nspec = "{spec}"\n'
+        checkpoints.write_text(text)
+        (cell,) = learned(checkpoints)
+        assert (cell.family, cell.labels, cell.trained_on) == (facts.family, facts.labels, facts.trackers)
+        assert "vis_navi" in cell.trained_tasks and cell.trained_tasks == facts.tasks
+    checkpoints.write_text(text.replace("vis_navi", "sit_sofa"))
+    with pytest.raises(
+        InputError, match=r"was trained on boxing vis_navi, cell one/twist2/sit_sofa/base plays sit_sofa"
+    ):
         learned(checkpoints)
 
 
