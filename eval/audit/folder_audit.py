@@ -14,7 +14,7 @@ from pathlib import Path
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.line_checks import action_faults, configuration_faults, is_current, line_faults
 from arena_newton.eval.folders.original_format import ORIGINAL
-from arena_newton.eval.folders.results import Results, RunRecord, in_plan_order, results_json
+from arena_newton.eval.folders.results import OWN_FOLDER, Results, RunRecord, in_plan_order, results_json
 from arena_newton.eval.records.chain import broken_links
 from arena_newton.eval.records.document import CONFIG_FILE, plan_faults, read_document, step_budgets
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, read_journal, write_atomic
@@ -223,6 +223,9 @@ def _derived_faults(run: RunRecord, found: Audit) -> Iterator[str]:
         else:
             what = "the figures and names in its text were compared, not what its style and script show"
             found.notes.append(f"{name} was written with another template: {what}.")
+    if (run.folder / ORIGINAL).is_symlink():
+        yield f"{run.folder / ORIGINAL}: is a link; a run writes inside its own folder only"
+        return
     extra = {path.relative_to(run.folder).as_posix() for path in (run.folder / ORIGINAL).rglob("*") if path.is_file()}
     for name in sorted(extra - set(wanted)):
         yield f"{run.folder / name}: is of no episode of the journal"
@@ -300,12 +303,13 @@ def write_pages(audits: list[Audit], out: Path) -> None:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """A results folder itself, or all in a folder of several, such as a suite.
+    """All results folders in a folder: itself, and those below, as of a suite, but for a run's own replays.
 
     Raises:
         InputError: There is none.
     """
-    found = [folder] if (folder / CONFIG_FILE).is_file() else sorted(p.parent for p in folder.rglob(CONFIG_FILE))
+    known = (path.relative_to(folder).parent for path in folder.rglob(CONFIG_FILE))
+    found = [folder / inside for inside in sorted(known) if OWN_FOLDER not in inside.parts]
     if not found:
         raise InputError(f"{folder}: no results folder (it has no {CONFIG_FILE})")
     return found

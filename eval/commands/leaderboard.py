@@ -46,7 +46,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
 
     from arena_newton.cli.flags import check_least, user_path
     from arena_newton.eval.audit.folder_audit import print_findings
-    from arena_newton.eval.leaderboard.checked_entry import check_entry, played_elsewhere
+    from arena_newton.eval.leaderboard.checked_entry import check_entry, named_alike, played_elsewhere
     from arena_newton.eval.leaderboard.entry_file import ENTRY_FILE
     from arena_newton.eval.leaderboard.site import write_site
     from arena_newton.eval.records.journal import StorageError
@@ -74,7 +74,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
         for folder in entries:
             into = Path(scratch) / folder.name
             one = check_entry(folder, into, replays=options.replay, draw=options.draw or 0, factories=factories)
-            one.faults += played_elsewhere(one, found)
+            one.faults += [*played_elsewhere(one, found), *named_alike(one, found)]
             found.append(one)
             print(f"{folder}: {one.entry.level}, {counted(len(one.rates), 'rate')}")
             print_findings(one.faults, one.notes)

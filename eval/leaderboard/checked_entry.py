@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -42,7 +43,7 @@ from arena_newton.trackers import shipped_weights
 if TYPE_CHECKING:
     from arena_newton.eval.play.factories import Factories
 
-__all__ = ["CheckedEntry", "check_entry", "played_elsewhere"]
+__all__ = ["CheckedEntry", "check_entry", "named_alike", "played_elsewhere"]
 
 PROTOCOL_RULES = "paper"
 """Rule set of the protocol."""
@@ -145,6 +146,17 @@ def played_elsewhere(entry: CheckedEntry, others: Sequence[CheckedEntry]) -> Ite
     for other in others:
         if shared := mine & _evidence(other):
             yield f"{entry.name}/{BUNDLE_FILE}: {len(shared)} of its runs and episodes are those of entry {other.name}"
+
+
+def named_alike(entry: CheckedEntry, others: Sequence[CheckedEntry]) -> Iterator[str]:
+    """Entries among others whose name a reader would take for that of one."""
+
+    def read(one: CheckedEntry) -> str:
+        return " ".join(unicodedata.normalize("NFKC", one.entry.name).casefold().split())
+
+    for other in others:
+        if read(other) == read(entry):
+            yield f"{entry.name}/{ENTRY_FILE}: name is {shown(entry.entry.name)}, as that of entry {other.name}"
 
 
 def _evidence(entry: CheckedEntry) -> set[str]:

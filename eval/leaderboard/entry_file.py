@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import CONSISTENT, LEVELS, SELF_REPORTED
 from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
-from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, loaded, read_regular
-from arena_newton.files.text import is_printable, plain_text
+from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, is_name, loaded, read_regular
+from arena_newton.files.text import is_printable, plain, plain_text
 
 __all__ = ["BUNDLE_FILE", "ENTRY_FILE", "SIMULATOR", "UNTRAINED", "BoardEntry", "entry_text", "read_entry"]
 
@@ -31,6 +31,8 @@ _DATE = re.compile(r"\d{4}-(?:0[1-9]|1[0-2])(?:-(?:0[1-9]|[12]\d|3[01]))?")
 Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(_DATE.fullmatch(v)))]
 Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]
 Level = Annotated[str, Known(lambda: tuple(LEVELS))]
+Visible = Annotated[str, Fit("a name that can be read", lambda v: is_name(v) and v == plain(v))]
+"""Name without characters that no one sees: with one it would look like another's."""
 Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v))]
 
 
@@ -38,9 +40,9 @@ Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v
 class BoardEntry:
     """Statements of an entry about itself, a key of `entry.toml` each."""
 
-    name: Name
+    name: Visible
     """Policy as the board names it."""
-    authors: Name
+    authors: Visible
     date: Date
     source: Name
     """Address of code or publication, or the command that plays it."""

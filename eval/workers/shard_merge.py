@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.results import Results, RunRecord, due_episodes, is_complete, load_run
 from arena_newton.eval.folders.run_folder import RECORDING_FLAGS, comparable, setting
 from arena_newton.eval.plan.options import RunOptions
-from arena_newton.eval.records.chain import outcome_of
+from arena_newton.eval.records.chain import broken_links, outcome_of
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE, Document, Status, plan_numbers
 from arena_newton.eval.records.identity import differing_key, moving_versions
 from arena_newton.eval.records.journal import (
@@ -27,6 +27,7 @@ from arena_newton.eval.records.journal import (
     EpisodeRecord,
     StorageError,
     chained_line,
+    read_journal,
     write_atomic,
 )
 from arena_newton.eval.records.sharding import Shard, dealt, read_shard
@@ -86,6 +87,8 @@ def merge(folders: Sequence[Path], out: Path, *, partial: bool = False, accept_v
     for folder in folders:
         if (folder / SUITE_FILE).is_file():
             raise InputError(f"merge {folder}: is a suite, whose parts are joined by copying one folder over the other")
+    for folder in folders:
+        _check_links(folder / JOURNAL_FILE)
     runs = sorted((load_run(folder) for folder in folders), key=_order)
     for other in runs[1:]:
         _check_alike(runs[0], other, accept_versions)
@@ -138,6 +141,13 @@ def _check_out(out: Path, folders: Sequence[Path]) -> None:
     inside = next((folder for folder in folders if out.resolve().is_relative_to(folder.resolve())), None)
     if inside is not None:
         raise InputError(f"--out {out}: is in {inside}, which stays as it is; name a new folder beside it")
+
+
+def _check_links(journal: Path) -> None:
+    """Refuse a journal of which a line was changed: the merged lines are linked again, which would hide it."""
+    if journal.exists():
+        for fault in broken_links(journal, read_journal(journal)[0]):
+            raise InputError(fault)
 
 
 def _shard(run: RunRecord) -> Shard | None:

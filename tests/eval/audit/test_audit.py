@@ -202,6 +202,14 @@ LEVEL |= {"another drive in tables and flags": "head"}
 """Means that find a forgery, where lines alone do not; the world of these tests heeds no action."""
 
 
+def test_a_link_in_a_folder_is_not_followed(folder, tmp_path, capsys):
+    """Derived files behind a link are not looked through, however many there are."""
+    shutil.rmtree(folder / "original")
+    (folder / "original").symlink_to(tmp_path)
+    code, found = audit(folder, capsys)
+    assert code == 1 and len(found) == 1 and "/original: is a link; a run writes inside its own folder only" in found[0]
+
+
 @pytest.mark.parametrize("name", [name for name in FORGERIES if name != "signals of a failure"])
 def test_forgeries_are_found(folder, name):
     """A forger who makes links and tables again is found by the lines, by a replay or by the published head."""

@@ -159,6 +159,7 @@ def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
     ("keys", "named"),
     [
         ({"name": ""}, 'name is "", expected a name'),
+        ({"name": "Ours\u200b"}, "expected a name that can be read"),
         ({"date": "yesterday"}, "date is"),
         ({"date": "2026-13-01"}, "date is"),
         ({"training_data": "secret"}, "training_data is"),
@@ -256,9 +257,8 @@ def test_an_edited_result_is_found(entry, edit, named, capsys):
 
 def test_an_entry_is_of_one_policy_and_of_one_owner(made, entry, capsys):
     """Two policies in one place, of which a board would show the better, and another entry's episodes contradict."""
-    both = made.parent / "both"
-    shutil.copytree(made.parent / "run", both / "expert", dirs_exist_ok=True)
-    assert main([*FLAGS, "--policy", "stand", "--out", str(both / "stand")], factories()) == 0
+    both = shutil.copytree(made.parent / "run", made.parent / "both")
+    assert main([*FLAGS, "--policy", "stand", "--out", str(both / "stand")], factories()) == 0  # below the other run
     assert main(["bundle", str(both), "--out", str(entry.parent / "both")]) == 0
     fill(entry.parent / "both", **KEYS)
     code, said, site = build(entry.parent / "both", capsys)
@@ -275,6 +275,9 @@ def test_an_entry_is_of_one_policy_and_of_one_owner(made, entry, capsys):
     assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
     said = capsys.readouterr().out
     assert "theirs/bundle.zip: 8 of its runs and episodes are those of entry ours" in said, said
+    fill(theirs, name="\uff2furs")  # of full width
+    assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
+    assert ", as that of entry ours" in capsys.readouterr().out
 
 
 def renamed(members):

@@ -15,6 +15,7 @@ from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.workers import shard_merge
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.rules import seeding
+from benchmarks.audits.forgeries import journal_lines, write_lines
 
 FLAGS = ["--task", "football", "boxing", "--engine", "mujoco", "--mode", "base", "execution", "--repeats", "4"]
 TABLES = ("results.json", "table.md", "table.csv", "report.md", "report.html")
@@ -50,12 +51,11 @@ def shards(folder):
     return [folder / name for name in ("s1", "s2", "s3")]
 
 
-def edited(folder, change, number=0):
-    """Change a line of a journal."""
-    path = folder / "episodes.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
+def edited(folder, change, number=0, *, link=True):
+    """Change a line of a journal; its links are made again."""
+    lines = journal_lines(folder)
     change(lines[number])
-    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
+    write_lines(folder, lines, link=link)
     return lines[number]
 
 
@@ -130,7 +130,7 @@ def test_other_counts_of_shards_join(played, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("outcome", None), ("steps", 0), ("margin", 0.123), ("overflow", True), ("phases", [["a", 0]])]
+    ("key", "value"), [("outcome", None), ("steps", 1), ("margin", 0.123), ("overflow", True), ("phases", [["a", 0]])]
 )
 def test_overlaps_that_differ_are_refused(copied, played, key, value):
     """Two folders with one episode and another value of it are refused: episode, value and both folders are named."""
@@ -147,6 +147,14 @@ def test_overlaps_that_differ_are_refused(copied, played, key, value):
     text = str(caught.value)
     assert text.startswith(words) and f"in {copied / 's1'}" in text and f"in {copied / 'again'}" in text
     assert not (copied / "m").exists() and not list(copied.glob("*.part"))
+
+
+def test_a_changed_line_is_not_linked_again(copied):
+    """A shard whose line was changed without its links is refused by its line: merged, it would look untouched."""
+    edited(copied / "s2", lambda line: line.update(margin=0.123), 2, link=False)
+    with pytest.raises(InputError, match=r"s2/episodes.jsonl: line 4 is not linked to line 3: a line was changed"):
+        merge(shards(copied), copied / "m")
+    assert not (copied / "m").exists()
 
 
 def test_overlaps_of_other_times_join(copied):
@@ -196,13 +204,12 @@ def test_environments_of_any_two_folders_are_held_together(copied):
 def strips(folder, *without):
     """Give the episodes of a folder strips, some of which get lost."""
     (folder / "strips").mkdir()
-    lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    lines = journal_lines(folder)
     for line in lines:
         line["media"]["world strip"] = f"strips/{line['index']}.jpg"
         if line["index"] not in without:
             (folder / "strips" / f"{line['index']}.jpg").write_text(str(line["index"]))
-    text = "".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines)
-    (folder / "episodes.jsonl").write_text(text)
+    write_lines(folder, lines)
     return [line["index"] for line in lines]
 
 
@@ -235,11 +242,11 @@ def test_successes_that_were_to_be_kept(copied):
         seed = seeding.planned_seed(tasks.get(task).gym_id, "demonstration", 0, number % 12)
         part = {"index": number, "task": task, "mode": mode, "repeat": number % 12, "episode_seed": seed}
         budget = tasks.get(task).max_steps(rule_sets.get("paper"))
-        lines.append(json.dumps(line | part | {"object_seed": seeding.object_seed(seed), "max_steps": budget}) + "\n")
-    (folder / "episodes.jsonl").write_text("".join(lines))
+        lines.append(line | part | {"object_seed": seeding.object_seed(seed), "max_steps": budget})
+    write_lines(folder, lines)
     merged = merge([folder], copied / "m")
     assert merged.results["complete"] and merged.run.status["state"] == "success"
-    (folder / "episodes.jsonl").write_text("".join(lines[:-1]))
+    write_lines(folder, lines[:-1])
     with pytest.raises(InputError, match="successes of at most 48 episodes missing: .*s1 has 15 of 48"):
         merge([folder], copied / "n")
     merged = merge([folder], copied / "n", partial=True)
