@@ -105,6 +105,8 @@ class TrainingBenchOptions(PlainBenchOptions):
     device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights, as of a training."""
+    looks: float = field(default=0.0, metadata=bounds(0.0, 1.0))
+    """Fraction of the samples whose looks are changed; without datasets shapes and lights are made up."""
     graph: bool = True
     """Capture batch and step in one CUDA graph, on CUDA."""
     compile: bool = False

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from arena_newton.pictures.changed_looks import COLOURS
 from arena_newton.policies.train.frames.demonstration_rows import EpisodeRows
 from arena_newton.policies.train.frames.frame_store import FrameStore, assembled, check_memory
+from arena_newton.policies.train.frames.look_store import LookStore
 from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 
-__all__ = ["made_frames"]
+__all__ = ["made_frames", "made_looks"]
 
 
 def made_frames(
@@ -40,3 +42,26 @@ def made_frames(
         actions = rng.normal(size=(rows, ACTION_WIDTH)).astype(np.float32)
         episodes.append(EpisodeRows(states, actions, "Walk to the sign.", "vis_navi"))
     return assembled(episodes, pictures, [False] * len(episodes), band, band)
+
+
+def made_looks(store: FrameStore, fraction: float, shapes: int = 40) -> LookStore:
+    """Looks of all rows of a store: upright strips of so many shapes, under lights of noise.
+
+    Args:
+        fraction: Fraction of the samples whose looks change.
+    """
+    device, (count, height, width) = store.device, store.pictures.shape[:3]
+    frames = torch.randint(64, 192, (count, height, width, 2), dtype=torch.uint8, device=device)
+    frames[..., 0] = 2 + torch.arange(width, device=device) * shapes // width
+    rows = torch.arange(store.rows, device=device)
+    every = torch.zeros_like(rows)
+    return LookStore(
+        frames=frames,
+        number=store.picture[rows],
+        back=every,
+        table=every,
+        chances=torch.ones((1, 256), device=device),
+        objects=torch.arange(256, device=device)[None],
+        colours=torch.arange(COLOURS, device=device)[None],
+        fractions=torch.full((store.rows,), fraction, device=device),
+    )

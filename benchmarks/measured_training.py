@@ -33,12 +33,13 @@ from arena_newton.policies.train.frames.demonstration_rows import (
 )
 from arena_newton.policies.train.frames.feature_scaling import Stats
 from arena_newton.policies.train.frames.frame_store import FrameStore, load_frames, made_statistics
+from arena_newton.policies.train.frames.look_store import load_looks
 from arena_newton.policies.train.network_compiler import check_compiler
 from arena_newton.policies.train.network_memory import network_bytes
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.training import fast_kernels, make_batches
 from benchmarks.bench_options import TrainingBenchOptions
-from benchmarks.made_frames import made_frames
+from benchmarks.made_frames import made_frames, made_looks
 
 __all__ = ["READY", "WARM_STEPS", "SpeedFigure", "bench_recipe", "main"]
 
@@ -84,11 +85,15 @@ def _data(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch
     """Rows on the device and their statistics."""
     network = network_bytes(settings, device)
     if not options.dataset:
-        return made_frames(options.frames, settings.picture, device, network=network), made_statistics()
+        store = made_frames(options.frames, settings.picture, device, network=network)
+        looks = made_looks(store, options.looks) if options.looks else None
+        return dataclasses.replace(store, looks=looks), made_statistics()
     datasets, stats = _read(options, settings)
     ones = torch.ones(len({episode.task for dataset in datasets for episode in dataset.episodes}))
     stats = {**stats, VECTOR_KEY: {"mean": 0 * ones, "std": ones}}
-    return load_frames(datasets, device, network=network), stats
+    store = load_frames(datasets, device, network=network)
+    looks = load_looks(datasets, store, options.looks, {}, network=network) if options.looks else None
+    return dataclasses.replace(store, looks=looks), stats
 
 
 def _trainer(options: TrainingBenchOptions, settings: TrainingRecipe, device: torch.device) -> PolicyTrainer:

@@ -42,11 +42,11 @@ def test_trainings_are_measured_side_by_side(monkeypatch):
             training_bench.measure(dataclasses.replace(given, frames=frames), 2)
 
 
-@pytest.mark.parametrize("lerobot", [False, True])
-def test_a_measured_training_counts_its_steps(lerobot, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("lerobot", "looks"), [(False, 0.0), (False, 0.6), (True, 0.0)])
+def test_a_measured_training_counts_its_steps(lerobot, looks, tmp_path, monkeypatch, capsys):
     """Ours and LeRobot's loop say that they are ready, wait for a line, and answer the speed of real steps."""
     monkeypatch.setattr(sys, "stdin", io.StringIO("go\n"))
-    flags = dataclasses.asdict(dataclasses.replace(SMALL, workers=0))
+    flags = dataclasses.asdict(dataclasses.replace(SMALL, workers=0, looks=looks))
     if lerobot:
         flags["dataset"] = [str(make_dataset(tmp_path / "data"))]
     assert measured_training.main(json.dumps(flags), *(["lerobot"] if lerobot else [])) == 0
