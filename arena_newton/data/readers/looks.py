@@ -68,12 +68,13 @@ class Looks:
     def objects(self) -> np.ndarray:
         """First byte of the object that the shape of each byte is part of, int64, shape [256].
 
-        An object is what is directly under `/World`; walls and floor of a room are each its own.
+        An object is what is directly under `/World`; walls and floor of a room are each its own. So is a part of
+        another kind: a lever that got the colour of its door could not be found.
         """
-        found, known = np.arange(256), dict[str, int]()
-        for byte, (prim, _) in enumerate(self.shapes, FIRST_SHAPE):
+        found, known = np.arange(256), dict[tuple[str, float], int]()
+        for byte, (prim, kind) in enumerate(self.shapes, FIRST_SHAPE):
             name = prim if prim.startswith("/World/Room/") else "/".join(prim.split("/")[:3])
-            found[byte] = known.setdefault(name, byte)
+            found[byte] = known.setdefault((name, kind), byte)
         return found
 
     def plain(self) -> dict[str, object]:

@@ -49,11 +49,12 @@ def test_films_keep_every_byte(recordings):
 
 
 def test_bytes_name_shapes_and_their_objects():
-    """A byte's probability is that of its shape, none of robot and background; parts of an object have one number."""
-    shapes = ("/World/Room/Floor", 1.0), ("/World/Room/Walls", 1.0), ("/World/Sofa/Arm", 1.0), ("/World/Sofa/Seat", 0.5)
+    """A byte's probability is that of its shape, none of robot and background; an object's parts of a kind share a number."""
+    room = ("/World/Room/Floor", 1.0), ("/World/Room/Walls", 1.0)
+    shapes = *room, ("/World/Door/Leaf", 1.0), ("/World/Door/Lever", 0.5), ("/World/Door/Rim", 1.0)
     looks = Looks(5, ((1000.0,),), shapes)
-    assert looks.chances()[: FIRST_SHAPE + 5].tolist() == [0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 0.0]
-    assert looks.objects()[:7].tolist() == [0, 1, 2, 3, 4, 4, 6]
+    assert looks.chances()[: FIRST_SHAPE + 6].tolist() == [0.0, 0.0, 1.0, 1.0, 1.0, 0.5, 1.0, 0.0]
+    assert looks.objects()[:8].tolist() == [0, 1, 2, 3, 4, 5, 4, 7]
     assert Looks.read(json.loads(json.dumps(looks.plain())), "here") == looks
 
 
