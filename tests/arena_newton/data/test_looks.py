@@ -49,7 +49,7 @@ def test_films_keep_every_byte(recordings):
 
 
 def test_bytes_name_shapes_and_their_objects():
-    """A byte's probability is that of its shape, none of robot and background; an object's parts of a kind share a number."""
+    """A byte's probability is its shape's, none of robot and background; an object's parts of a kind share a number."""
     room = ("/World/Room/Floor", 1.0), ("/World/Room/Walls", 1.0)
     shapes = *room, ("/World/Door/Leaf", 1.0), ("/World/Door/Lever", 0.5), ("/World/Door/Rim", 1.0)
     looks = Looks(5, ((1000.0,),), shapes)
