@@ -500,20 +500,21 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 PROBE = """<p></p><script>onload = () => { document.querySelector('p').textContent = Array.from(frames).map(frame => {
 const d = frame.document, e = d.documentElement, s = d.querySelector('select[name=tracker]');
 const before = d.querySelector('output').textContent;
+const cut = [...d.querySelectorAll('small')].filter(one => one.scrollWidth > one.clientWidth + 1).length;
 s.value = 'sonic'; s.dispatchEvent(new frame.Event('change'));
 const head = d.querySelectorAll('th')[6]; head.querySelector('button').click();
 const shown = [...head.closest('table').tBodies[0].rows].filter(r => !r.hidden).map(r => r.cells[6].dataset.value);
-return [e.scrollWidth, e.clientWidth, before, d.querySelector('output').textContent, head.ariaSort, shown.join(' ')]
-.join()}).join(';')}</script>"""
+return [e.scrollWidth, e.clientWidth, before, d.querySelector('output').textContent, head.ariaSort, cut,
+shown.join(' ')].join()}).join(';')}</script>"""
 
 
 def test_the_board_in_a_browser(tmp_path, monkeypatch):
-    """In a browser the board filters and sorts, and at 400 and 1280 px nothing is wider than the window."""
+    """In a browser the board filters and sorts, and at 400 and 1280 px nothing is wider than the window or cut."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         pytest.skip(f"needs a browser ({', '.join(BROWSERS)}), none is installed")
     monkeypatch.chdir(ROOT)
-    entries = ["leaderboard/wb_wam", "leaderboard/paper_act", "leaderboard/paper_dp"]
+    entries = [f"leaderboard/{name}" for name in ("wb_wam", "paper_act", "paper_dp", "expert")]
     assert main(["leaderboard", "build", *entries, "--out", str(tmp_path / "site")]) == 0
     frames = "".join(f"<iframe src='site/index.html' width={width} height=900></iframe>" for width in (400, 1280))
     (tmp_path / "probe.html").write_text(frames + PROBE)
@@ -522,7 +523,7 @@ def test_the_board_in_a_browser(tmp_path, monkeypatch):
     command += ["--dump-dom", (tmp_path / "probe.html").as_uri()]
     page = subprocess.run(command, capture_output=True, text=True, timeout=500).stdout
     frames = [frame.split(",") for frame in re.search("<p>(.*)</p>", page)[1].split(";")]
-    for width, limit, before, after, sort, values in frames:
+    for width, limit, before, after, sort, cut, values in frames:
         rates = [float(value) for value in values.split()]
         assert int(width) <= int(limit) and before != after and before.startswith(before.split()[2]), frames
-        assert sort == "descending" and len(rates) == 3 and rates == sorted(rates, reverse=True)
+        assert cut == "0" and sort == "descending" and len(rates) == 3 and rates == sorted(rates, reverse=True)
