@@ -123,14 +123,14 @@ def test_trainings_have_the_time_that_recording_leaves(tmp_path):
     line = '{{"stage": "{}", "name": "a", "began": {}, "ended": {}, "code": 0}}\n'
     (tmp_path / "commands.jsonl").write_text(line.format("record", 0, 180) + line.format("build", 120, 240))
     assert training_minutes(plan, None, tmp_path, 3, 4) == 12.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 6) == 24.0 - 5.0 - 4.0
-    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 5.0
-    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 15.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 6) == 24.0 - 6.5 - 4.0
+    assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 4.5
+    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 13.5
     with pytest.raises(InputError, match="^--minutes 9: recording and building took 4.0, nothing is left to train in"):
         training_minutes(plan, 9.0, tmp_path, 3, 6)
     with (tmp_path / "commands.jsonl").open("a") as file:
         file.write(line.format("train", 250, 310).replace('"code": 0', '"code": -9'))
-    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 14.0  # what a killed one took is gone
+    assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 12.5  # what a killed one took is gone
 
 
 BAD = [
