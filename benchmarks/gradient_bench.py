@@ -88,9 +88,9 @@ def slope_figures(options: GradientBenchOptions) -> Iterator[BenchFigure]:
             for repeat in range(options.episodes)
         ),
         "reach": reach_figures,
-        "featherstone": featherstone_figures,
         "flights": flight_figures,
         "transition": transition_figures,
+        "featherstone": lambda: featherstone_figures(options.limit),
     }
     for figures in chosen(options.what, items).values():
         yield from figures()

@@ -19,7 +19,7 @@ from arena_newton.eval.__main__ import main
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
-LONGER = {"finetune": 245, "fit_motion": 65, "identify": 120, "slopes": 75, "word_agent": 123}
+LONGER = {"finetune": 245, "fit_motion": 65, "identify": 150, "slopes": 75, "word_agent": 123}
 """Example of more lines → their number: three methods, or a method and its peer, on one problem; a whole agent."""
 RUN = "--task boxing --tracker twist2 --seeds 0 --repeats 1 --engine mujoco --max-steps 4 --out OUT".split()
 SHORT: dict[str, list[str]] = {
@@ -28,7 +28,7 @@ SHORT: dict[str, list[str]] = {
     "drive_by_code": ["--max-steps", "55"],
     "finetune": ["--seconds", "0.1", "--max-steps", "4"],
     "fit_motion": ["--iterations", "2", "--plays", "2", "--max-steps", "6"],
-    "identify": ["--windows", "1", "--iterations", "1"],
+    "identify": ["--windows", "1", "--iterations", "1", "--most", "2"],
     "first_episode": ["--max-steps", "8", "--out", "OUT"],
     "own_policy": ["--max-steps", "15"],
     "own_tracker": ["--max-steps", "4"],
@@ -48,7 +48,10 @@ SAYS = {
     "drive_by_code": r"1 s  x [+-]0.\d\d  y -1.\d\d  height 0.7\d m\ntimeout; ahead from 0 s\n",
     "finetune": r"(gradient  error 0\.\d+ rad .*\n){2,}(PPO .* s\n){2,}(ES .* s\n){2,}",
     "fit_motion": r"(gradient  misfit 0\.\d+ .* s\n){2}(CEM       misfit \d\.\d+ .* s\n)+",
-    "identify": r"(fit  misfit .*\n)+singular values:( \d+){18}\n(.* standard error .* %\n){18}(CEM  misfit .* s\n)+",
+    "identify": (
+        r"((fit  misfit .*\n)+.*: two standard errors are \d+\.\d %\n){2}singular values:( \d+){18}\n"
+        r"(.* standard error .* %\n){18}(CEM  misfit .* s\n)+\| robot .*\n.*\n\| 0 \| 2 \| .* s \|\n"
+    ),
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
     "own_policy": r"11 promises kept\n(boxing/base/s\d/r\d: timeout after 15 ticks\n){6}",
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",

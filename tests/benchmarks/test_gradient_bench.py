@@ -1,10 +1,12 @@
 """The bench of gradients: slopes of ticks and of closed loops are those of differences, and one that is off misses."""
 
+import threading
+
 import pytest
 import torch
 
 from arena_newton.robot.canonical import STAND_ACTION
-from benchmarks import flight_bench, gradient_bench
+from benchmarks import featherstone_bench, flight_bench, gradient_bench
 from benchmarks.bench_options import GradientBenchOptions
 
 
@@ -80,3 +82,23 @@ def test_flights_and_mujocos_differences_are_figures(monkeypatch):
     flight, transition = gradient_bench.slope_figures(GradientBenchOptions(what=("flights", "transition")))
     assert 0.0 < flight.value < 1.0 and flight.unit == "cm"
     assert 0.0 <= transition.value < 1.0 and "1 states" in transition.note
+
+
+def test_a_solver_that_does_not_end_is_left(monkeypatch, capsys):
+    """Stages are told as they begin; after the limit the last that ended is named, and an error is the bench's."""
+    ends = threading.Event()
+
+    def stages():
+        seconds, _ = featherstone_bench._stage("robots", "cpu", lambda: None)
+        yield featherstone_bench._duration("robots built", seconds)
+        featherstone_bench._stage("kernels", "cpu", ends.wait)
+
+    monkeypatch.setattr(featherstone_bench, "_figures", stages)
+    built, left = featherstone_bench.featherstone_figures(0.5)
+    assert built.name.endswith("robots built") and (left.verdict, left.bar) == ("MISS", 0.5)
+    assert left.note == f"not ended, after {built.name}"
+    assert capsys.readouterr().err == "featherstone: robots ...\nfeatherstone: kernels ...\n"
+    ends.set()
+    monkeypatch.setattr(featherstone_bench, "_figures", lambda: iter([1 / 0 for _ in "x"]))
+    with pytest.raises(ZeroDivisionError):
+        list(featherstone_bench.featherstone_figures(5.0))
