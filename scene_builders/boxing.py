@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd
 
+from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import TASK
-from scene_builders import author, rooms, warehouse
+from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
 
 BAG_RADIUS = 0.155
@@ -62,38 +63,49 @@ def _bag(stage: Usd.Stage, name: str, centre: author.Vec, skin: Usd.Prim, metal:
 
 
 def _semantic_2(folder: Path) -> None:
-    """A gym: granulate floor, striped walls, leather and blue bags, and an upright green drum with a pale band."""
+    """A dojo: straw mats, paper walls, a plum and a white bag on wooden posts, a pale green disc with a hub."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="rubber")
-        rooms.look(stage, "Wall", texture="wallpaper")
-        rooms.look(stage, "BagBlack", (0.36, 0.17, 0.07))
-        rooms.look(stage, "BagRed", (0.04, 0.1, 0.4))
-        rooms.look(stage, "Metal", (0.5, 0.5, 0.52))
-        green, pale = rooms.look(stage, "TargetGreen", (0.1, 0.75, 0.02)), rooms.look(stage, "Pale", (0.8, 0.9, 0.6))
-        frame, edge = "/World/Target/Frame", 2 * TARGET_RADIUS
+        rooms.look(stage, "Floor", texture="tatami")
+        rooms.look(stage, "Wall", texture="shoji")
+        rooms.look(stage, "Skirting", (0.1, 0.045, 0.02))
+        rooms.look(stage, "BagBlack", (0.26, 0.02, 0.1))
+        rooms.look(stage, "BagRed", (0.75, 0.72, 0.64))
+        rooms.look(stage, "Metal", (0.3, 0.15, 0.06))
+        green, hub = rooms.look(stage, "TargetGreen", (0.12, 0.8, 0.2)), rooms.look(stage, "Hub", (0.9, 0.9, 0.85))
+        frame, width = "/World/Target/Frame", 2 * TARGET_RADIUS
         rooms.without(stage, f"{frame}/Ball")
-        author.cylinder(stage, f"{frame}/Drum", TARGET_RADIUS, edge, collide=False, look=green)
-        author.cylinder(stage, f"{frame}/Band", TARGET_RADIUS + 0.001, edge / 4, collide=False, look=pale)
+        author.cylinder(stage, f"{frame}/Disc", TARGET_RADIUS, width - 0.002, axis="Y", collide=False, look=green)
+        author.cylinder(stage, f"{frame}/Hub", 0.25 * TARGET_RADIUS, width, axis="Y", collide=False, look=hub)
 
 
 def _semantic_3(folder: Path) -> None:
-    """A club: mats of four hues, wooden walls, a pale and a striped bag, a green diamond, and boxes to jump on."""
+    """An indoor track: red lanes, block walls over blue mats, a lilac and a banded bag, a dark green cross, hurdles."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="mats")
-        rooms.look(stage, "Wall", texture="bars")
-        rooms.look(stage, "BagBlack", (0.7, 0.66, 0.56))
-        rooms.look(stage, "Metal", (0.55, 0.2, 0.03))
-        low, high = BAG_Z
-        skin = Solids().tube((0, 0, low), (0, 0, high), BAG_RADIUS + 0.001, sides=24, tile=0.4)
-        skin.write(stage, "/World/Bag_2/Stripes", look=rooms.look(stage, "Stripes", texture="barrier"))
-        frame = "/World/Target/Frame"
+        rooms.look(stage, "Floor", texture="track")
+        rooms.look(stage, "Wall", texture="blocks")
+        rooms.look(stage, "Skirting", (0.3, 0.3, 0.32))
+        rooms.look(stage, "BagBlack", (0.52, 0.44, 0.66))
+        rooms.look(stage, "BagRed", (0.85, 0.6, 0.08))
+        rooms.look(stage, "Metal", (0.1, 0.22, 0.4))
+        decor.dado(stage, "/World/Mats", *ROOM, 0.8, look=rooms.look(stage, "WallMat", (0.04, 0.16, 0.42)))
+        lanes = [((3.85, 0.025, 0.001), (-3.3, y, 0.003)) for y in (-5.6, -4.6, -3.6, -2.6, -1.6)]
+        warehouse.boxes(stage, "/World/Lanes", lanes, look=rooms.look(stage, "Lane", (0.85, 0.83, 0.78)))
+        bands = Solids()
+        for z in (0.62, 0.94):
+            bands.tube((0, 0, z), (0, 0, z + 0.14), BAG_RADIUS + 0.002, sides=24)
+        bands.write(stage, "/World/Bag_2/Bands", look=rooms.look(stage, "BagBand", (0.05, 0.05, 0.07)))
+        frame, thin = "/World/Target/Frame", 0.42 * TARGET_RADIUS
         rooms.without(stage, f"{frame}/Ball")
-        diamond = Solids()
-        for end in (-1, 1):
-            diamond.tube((0, 0, 0), (0, 0, end * TARGET_RADIUS), TARGET_RADIUS, taper=0.0, sides=4)
-        diamond.write(stage, f"{frame}/Diamond", look=rooms.look(stage, "TargetGreen", (0.0, 0.6, 0.08)))
-        steps = [((0.35, 0.35, z), (x, -5.6, z)) for x, z in ((-5.6, 0.3), (-4.7, 0.2), (-3.9, 0.12))]
-        warehouse.boxes(stage, "/World/JumpBoxes", steps, look=rooms.look(stage, "JumpBox", texture="quilt"), tile=0.7)
+        cross = Solids()
+        for axis in range(3):
+            cross.box(tuple(TARGET_RADIUS if k == axis else thin for k in range(3)))
+        cross.write(stage, f"{frame}/Cross", look=rooms.look(stage, "TargetGreen", (0.0, 0.34, 0.06)))
+        hurdles = Solids()
+        for x in (-5.9, -4.7):
+            hurdles.box((0.5, 0.02, 0.06), (x, -5.9, 0.8))
+            for side in (-0.45, 0.45):
+                hurdles.box((0.02, 0.02, 0.4), (x + side, -5.9, 0.4)).box((0.02, 0.25, 0.02), (x + side, -5.7, 0.02))
+        hurdles.write(stage, "/World/Hurdles", look=rooms.look(stage, "Hurdle", (0.85, 0.85, 0.82)))
 
 
 def build(folder: Path) -> None:

@@ -1,54 +1,48 @@
 """Furniture of held-out looks: drawn things that stand aside of every task, touched by nothing."""
 
-import numpy as np
 from pxr import Usd
 
-from scene_builders import author, rooms
+from scene_builders import author, rooms, warehouse
 from scene_builders.author import Vec
 from scene_builders.solids import Solids
 
-__all__ = ["cones", "lamp", "plant"]
+__all__ = ["dado", "parasol", "stool", "topiary"]
 
 
-def plant(stage: Usd.Stage, path: str, position: Vec, height: float = 1.0) -> None:
-    """A pot with arched leaves, `height` [m] tall, on the floor or table at `position`."""
+def dado(stage: Usd.Stage, path: str, low: Vec, high: Vec, height: float, *, look: Usd.Prim, tile: float = 1.0) -> None:
+    """Panelling, tiles or mats along the walls of the room `low`…`high` (x, y) up to `height`, 1 cm before them [m]."""
+    (x0, y0), (x1, y1), t, h = low, high, 0.005, height / 2
+    parts = [(((x1 - x0) / 2, t, h), ((x0 + x1) / 2, y, h)) for y in (y0 + t, y1 - t)]
+    parts += [((t, (y1 - y0) / 2, h), (x, (y0 + y1) / 2, h)) for x in (x0 + t, x1 - t)]
+    warehouse.boxes(stage, path, parts, look=look, tile=tile)
+
+
+def parasol(stage: Usd.Stage, path: str, position: Vec, color: Vec) -> None:
+    """A sunshade on a pole in a heavy foot."""
     author.xform(stage, path, position)
-    pot = Solids().tube((0, 0, 0), (0, 0, 0.3 * height), 0.12 * height, taper=1.4)
-    pot.write(stage, f"{path}/Pot", look=rooms.look(stage, "Pot", (0.5, 0.2, 0.12)))
-    leaves = Solids()
-    for number, angle in enumerate(np.arange(12) * 2.4):
-        out, top = np.array([np.cos(angle), np.sin(angle), 0.0]), (0.6 + 0.4 * (number % 3) / 2) * height
-        knee = 0.12 * height * out + (0, 0, 0.8 * top)
-        side = np.array([-out[1], out[0], 0.0])
-        leaves.cord((0, 0, 0.28 * height), knee, 0.05 * height, np.cross(side, knee))
-        leaves.cord(knee, 0.35 * height * out + (0, 0, top), 0.08 * height, (0, 0, 1))
-    leaves.write(stage, f"{path}/Leaves", look=rooms.look(stage, "Leaves", (0.05, 0.24, 0.07)))
+    pole = Solids().tube((0, 0, 0), (0, 0, 2.2), 0.025).tube((0, 0, 0), (0, 0, 0.12), 0.3, taper=0.5)
+    pole.write(stage, f"{path}/Pole", look=rooms.look(stage, "ParasolPole", (0.8, 0.78, 0.7)))
+    roof = Solids().tube((0, 0, 1.75), (0, 0, 2.2), 1.1, taper=0.02, sides=8)
+    roof.write(stage, f"{path}/Roof", look=rooms.look(stage, f"{path.rpartition('/')[2]}Roof", color))
 
 
-def lamp(stage: Usd.Stage, path: str, position: Vec) -> None:
-    """A standing lamp with a wide shade."""
+def stool(stage: Usd.Stage, path: str, positions: list[Vec], *, seat: Vec, legs: Vec) -> None:
+    """Round stools on four splayed legs, in the colours of seats and legs, linear RGB."""
+    seats, bars = Solids(), Solids()
+    for x, y in positions:
+        seats.tube((x, y, 0.44), (x, y, 0.48), 0.17, sides=16).ring(0.0, 0.17, (x, y, 0.48))
+        for sx, sy in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
+            bars.tube((x + 0.16 * sx, y + 0.16 * sy, 0), (x + 0.09 * sx, y + 0.09 * sy, 0.44), 0.015, sides=6)
+    seats.write(stage, f"{path}Seats", look=rooms.look(stage, "StoolSeat", seat))
+    bars.write(stage, f"{path}Legs", look=rooms.look(stage, "StoolLegs", legs))
+
+
+def topiary(stage: Usd.Stage, path: str, position: Vec, height: float, *, crown: Usd.Prim) -> None:
+    """A tree clipped to a ball in a square tub, `height` [m] tall."""
     author.xform(stage, path, position)
-    stand = Solids().box((0.14, 0.14, 0.015), (0, 0, 0.015)).tube((0, 0, 0), (0, 0, 1.4), 0.015)
-    stand.write(stage, f"{path}/Stand", look=rooms.look(stage, "LampStand", (0.04, 0.04, 0.04)))
-    shade = Solids().tube((0, 0, 1.3), (0, 0, 1.65), 0.24, taper=0.6, sides=16)
-    shade.write(stage, f"{path}/Shade", look=rooms.look(stage, "LampShade", (0.85, 0.62, 0.3)))
-
-
-def cones(stage: Usd.Stage, path: str, positions: list[Vec], height: float = 0.6) -> None:
-    """Orange traffic cones with a white collar, `height` [m] tall."""
-    orange, white = Solids(), Solids()
-    for position in positions:
-        foot = np.asarray(position, dtype=float)
-
-        def cone(
-            low: float, high: float, swell: float, foot: np.ndarray = foot
-        ) -> tuple[np.ndarray, np.ndarray, float, float]:
-            wide, narrow = (0.24 * (1 - z) * height + 0.02 + swell for z in (low, high))
-            return foot + (0, 0, low * height), foot + (0, 0, high * height), wide, narrow / wide
-
-        orange.box((0.15, 0.15, 0.01), foot + (0, 0, 0.012))
-        for solids, span, swell in ((orange, (0.0, 1.0), 0.0), (white, (0.4, 0.65), 0.003)):
-            start, end, radius, taper = cone(*span, swell)
-            solids.tube(start, end, radius, taper=taper, sides=16)
-    orange.write(stage, f"{path}Body", look=rooms.look(stage, "Cone", (0.85, 0.18, 0.02)))
-    white.write(stage, f"{path}Collar", look=rooms.look(stage, "ConeCollar", (0.9, 0.9, 0.9)))
+    tub = Solids().box((0.16 * height, 0.16 * height, 0.14 * height), (0, 0, 0.14 * height))
+    tub.write(stage, f"{path}/Tub", look=rooms.look(stage, "Tub", (0.42, 0.14, 0.06)))
+    trunk = Solids().tube((0, 0, 0.2 * height), (0, 0, 0.7 * height), 0.025 * height)
+    trunk.write(stage, f"{path}/Trunk", look=rooms.look(stage, "Trunk", (0.16, 0.09, 0.04)))
+    author.xform(stage, f"{path}/Top", (0, 0, 0.78 * height))
+    Solids().ball(0.22 * height).write(stage, f"{path}/Top/Crown", look=crown)

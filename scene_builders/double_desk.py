@@ -20,6 +20,9 @@ STIFF = (0.01, 1.0)
 HANDLE_RADIUS, HANDLE_LENGTH, HANDLE_MASS = 0.0165, 0.30, 0.13
 HEAD_HALF, HEAD_MASS = (0.05, 0.015, 0.015), 0.22
 """Head: 0.10 m across the handle, 0.03 m along it and 0.03 m high, flush with the handle's end."""
+DESKS = {"RightDesk": ((-3.8, -3.68), (-1.35, -2.93)), "LeftDesk": ((-3.9, -0.40), (-1.41, 0.33))}
+"""Lower and upper corner (x, y) of each bench [m]."""
+ROOM_LOW, ROOM_HIGH = (-5.6, -6.0), (2.0, 2.4)
 CRATE_HALF_X, CRATE_HALF_Y, CRATE_HEIGHT, PLATE = 0.3007, 0.2009, 0.17, 0.012
 """Outer half sizes, height and plate thickness of the crate [m] (thickness: our choice)."""
 
@@ -95,55 +98,66 @@ def crate(stage: Usd.Stage) -> None:
     author.marker(stage, f"{frame}/Inside", (2 * hx, 2 * hy, h), (0, 0, h / 2))
 
 
-def _hammer_looks(stage: Usd.Stage, handle: author.Vec, bands: author.Vec, head: author.Vec) -> None:
-    """Colours of the handle, of three bands around it and of the head, linear RGB."""
+def _hammer_looks(
+    stage: Usd.Stage, handle: author.Vec, head: author.Vec, grip: author.Vec, spans: list[tuple[float, float]]
+) -> None:
+    """Colours of handle, head and grip, linear RGB; the grip is drawn around `spans` of the handle, along y [m]."""
     rooms.look(stage, "handle", handle)
     rooms.look(stage, "iron", head, roughness=0.4)
-    rings = Solids()
-    for y in (-0.12, -0.06, 0.08):
-        rings.tube((0, y - 0.012, 0), (0, y + 0.012, 0), HANDLE_RADIUS + 0.0005, sides=24)
-    rings.write(stage, "/World/Hammer/Bands", look=rooms.look(stage, "bands", bands))
+    sleeve = Solids()
+    for low, high in spans:
+        sleeve.tube((0, low, 0), (0, high, 0), HANDLE_RADIUS + 0.0005, sides=24)
+    sleeve.write(stage, "/World/Hammer/Grip", look=rooms.look(stage, "grip", grip))
 
 
 def _semantic_2(folder: Path) -> None:
-    """A kitchen: chequered floor, striped wallpaper, blue tops on pale legs, wicker basket, red and white hammer."""
+    """A craft room: ochre linoleum, coral walls, cutting mats on red legs, yellow basket, orange and black hammer."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "concrete", texture="lino")
-        rooms.look(stage, "charcoal", texture="wallpaper")
-        rooms.look(stage, "glass", (0.75, 0.6, 0.35))
-        rooms.look(stage, "bench_top", (0.10, 0.15, 0.26))
-        rooms.look(stage, "bench_steel", (0.55, 0.56, 0.58))
-        rooms.look(stage, "sill", (0.5, 0.16, 0.08))
-        rooms.look(stage, "crate_trim", (0.26, 0.13, 0.04))
-        _hammer_looks(stage, (0.65, 0.05, 0.03), (0.85, 0.85, 0.82), (0.75, 0.66, 0.12))
-        wicker = [(np.asarray(half) + 0.001, centre) for half, centre in plates().values()]
-        look = rooms.look(stage, "wicker", texture="wicker")
-        warehouse.boxes(stage, "/World/Basket/Frame/Wicker", wicker, look=look, tile=0.2)
+        rooms.look(stage, "concrete", texture="linoleum")
+        rooms.look(stage, "charcoal", (0.72, 0.28, 0.2))
+        rooms.look(stage, "glass", (0.6, 0.72, 0.62))
+        rooms.look(stage, "bench_steel", (0.42, 0.03, 0.03))
+        rooms.look(stage, "sill", (0.06, 0.05, 0.12))
+        rooms.look(stage, "crate", (0.85, 0.55, 0.03))
+        rooms.look(stage, "crate_trim", (0.2, 0.09, 0.03))
+        _hammer_looks(stage, (0.8, 0.2, 0.02), (0.55, 0.56, 0.58), (0.02, 0.02, 0.02), [(-0.145, -0.03)])
+        mat = rooms.look(stage, "mat", texture="mat")
+        for name, corners in DESKS.items():
+            rooms.bench_cover(stage, f"/World/{name}", *corners, look=mat, tile=0.8)
+        panel = rooms.look(stage, "panelling", (0.7, 0.66, 0.55))
+        decor.dado(stage, "/World/Panelling", ROOM_LOW, ROOM_HIGH, 0.9, look=panel)
+        sheets = [((0.01, 0.35, 0.25), (ROOM_HIGH[0], y, 1.3)) for y in (-5.0, -3.9, -2.8, -1.7, -0.6, 0.5)]
+        warehouse.boxes(stage, "/World/Drawings", sheets, look=rooms.look(stage, "drawing", (0.15, 0.4, 0.75)))
+        decor.stool(stage, "/World/Stool", [(1.2, -4.4), (1.3, 0.6)], seat=(0.05, 0.3, 0.4), legs=(0.6, 0.4, 0.2))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A studio: terrazzo floor, painted walls, slate tops on ochre legs, mint crate, pink hammer, plants and a lamp."""
+    """A bakery: dark red tiles, glazed green walls, maple tops on white legs, blue basket, teal hammer, flour sacks."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "concrete", texture="terrazzo")
-        rooms.look(stage, "charcoal", texture="mural")
-        rooms.look(stage, "glass", (0.12, 0.16, 0.3))
-        rooms.look(stage, "bench_top", (0.05, 0.06, 0.08))
-        rooms.look(stage, "bench_steel", (0.55, 0.36, 0.05))
-        rooms.look(stage, "sill", (0.05, 0.16, 0.22))
-        rooms.look(stage, "crate", (0.25, 0.6, 0.45))
-        rooms.look(stage, "crate_trim", (0.55, 0.05, 0.3))
-        _hammer_looks(stage, (0.8, 0.12, 0.36), (0.95, 0.85, 0.3), (0.62, 0.64, 0.66))
-        for number, x in enumerate((0.9, -5.2)):
-            decor.plant(stage, f"/World/Plant_{number}", (x, -1.0, 0), 1.2)
-        decor.lamp(stage, "/World/Lamp", (0.6, -2.2, 0))
+        rooms.look(stage, "concrete", texture="quarry")
+        rooms.look(stage, "charcoal", texture="metro")
+        rooms.look(stage, "glass", (0.85, 0.75, 0.5))
+        rooms.look(stage, "bench_steel", (0.72, 0.72, 0.7))
+        rooms.look(stage, "sill", (0.6, 0.42, 0.12))
+        rooms.look(stage, "crate", (0.03, 0.12, 0.5))
+        rooms.look(stage, "crate_trim", (0.75, 0.78, 0.82))
+        spans = [(y - 0.006, y + 0.006) for y in (-0.13, -0.105, -0.08, -0.055, -0.03, 0.09)]
+        _hammer_looks(stage, (0.0, 0.35, 0.36), (0.03, 0.03, 0.035), (0.9, 0.88, 0.8), spans)
+        butcher = rooms.look(stage, "butcher", texture="butcher")
+        for name, corners in DESKS.items():
+            rooms.bench_cover(stage, f"/World/{name}", *corners, look=butcher, tile=0.8)
+        sack = rooms.look(stage, "sack", (0.55, 0.4, 0.24))
+        for number, (x, y) in enumerate(((1.5, -1.9), (1.6, -2.5), (1.5, -3.1), (-5.2, 1.6))):
+            half = (0.26, 0.2 + 0.05 * (number % 2), 0.27)
+            warehouse.rounded_box(stage, f"/World/Sack_{number}", half, (x, y, 0.27), radius=0.1, look=sack)
 
 
 def build(folder: Path) -> None:
     """Write `scene.usda` and `variants/` into `folder`."""
     stage = rooms.task_stage(folder, TASK, eye=(-0.55955, -2.63763, 2.16241), gaze=(0.70287, 0.42371, 0.29498, 0.48932))
-    looks = rooms.workshop(stage, low=(-5.6, -6.0), high=(2.0, 2.4), windows=[("+y", -3.4, 1.6, 0.3)])
-    rooms.bench(stage, "/World/RightDesk", (-3.8, -3.68), (-1.35, -2.93), solref=STIFF)
-    rooms.bench(stage, "/World/LeftDesk", (-3.9, -0.40), (-1.41, 0.33), solref=STIFF)
+    looks = rooms.workshop(stage, low=ROOM_LOW, high=ROOM_HIGH, windows=[("+y", -3.4, 1.6, 0.3)])
+    for name, corners in DESKS.items():
+        rooms.bench(stage, f"/World/{name}", *corners, solref=STIFF)
     # The low step between the desks, from the back wall past the benches; measured 0.05–0.09 m high.
     pale = author.material(stage, "/World/Looks/sill", (0.7, 0.7, 0.68))
     author.box(stage, "/World/Sill", (3.05, 0.0475, 0.035), (-2.55, -1.5225, 0.035), look=pale)

@@ -106,39 +106,58 @@ def goal(stage: Usd.Stage) -> None:
     author.marker(stage, "/World/Goal/Volume", (5.1, 2.0, 1.85), (0.05, 4.03, 0.925))
 
 
+def _beach(stage: Usd.Stage) -> None:
+    """Sunshades over loungers at both sides of the field."""
+    loungers = Solids()
+    for number, (x, y) in enumerate(((-5.2, 0.6), (-5.4, 3.4), (5.2, 1.4), (5.5, 4.0))):
+        decor.parasol(stage, f"/World/Parasol_{number}", (x, y, 0), ((0.75, 0.1, 0.06), (0.85, 0.7, 0.5))[number % 2])
+        loungers.box((0.3, 0.9, 0.03), (x, y, 0.3)).box((0.25, 0.03, 0.14), (x, y - 0.7, 0.14))
+        loungers.box((0.25, 0.03, 0.14), (x, y + 0.7, 0.14))
+    loungers.write(stage, "/World/Loungers", look=rooms.look(stage, "Lounger", (0.1, 0.3, 0.5)))
+
+
 def _semantic_2(folder: Path) -> None:
-    """A stadium: mown bands of turf, hoardings of several hues, turquoise goal with a blue net, red and blue ball."""
+    """A beach: sand, the sea behind, blue tape, red goal with a black net, orange and teal ball, sunshades."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        turf = rooms.look(stage, "grass", texture="turf")
-        author.quad(stage, "/World/Floor", 7.0, 7.0, (0, 0, 0), repeat=(7, 7), look=turf)
-        line = rooms.look(stage, "white", (0.85, 0.85, 0.85))
+        sand = rooms.look(stage, "grass", texture="sand")
+        author.quad(stage, "/World/Floor", 7.0, 7.0, (0, 0, 0), repeat=(5, 5), look=sand)
+        rooms.without(stage, "/World/CentreCircle")
+        tape = [((5.0, 0.05, 0.001), (0, -0.6, 0.003))] + [((0.05, 4.3, 0.001), (x, -1.3, 0.003)) for x in (-4, 4)]
+        warehouse.boxes(stage, "/World/Tape", tape, look=rooms.look(stage, "white", (0.02, 0.12, 0.55)))
         paint = {
-            "/World/CentreCircle": line,
-            "/World/Backdrop": rooms.look(stage, "hoarding", texture="hoarding"),
-            "/World/Goal/FrameLook": rooms.look(stage, "turquoise", (0.02, 0.45, 0.42)),
-            "/World/Goal/Net": rooms.look(stage, "blue", (0.05, 0.14, 0.5)),
+            "/World/Backdrop": rooms.look(stage, "sea", texture="sea"),
+            "/World/Goal/FrameLook": rooms.look(stage, "red", (0.6, 0.03, 0.02)),
+            "/World/Goal/Net": rooms.look(stage, "black", (0.015, 0.015, 0.02)),
             "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
         }
         rooms.paint(stage, paint)
+        _beach(stage)
 
 
 def _semantic_3(folder: Path) -> None:
-    """A sports hall: blue floor with lines, wooden walls, dark red goal, yellow and purple ball, benches and cones."""
+    """A schoolyard: asphalt with painted games, the school's front, blue goal with a green net, orange ball, trees."""
     with rooms.held_out(folder, "semantic-3") as stage:
         rooms.without(stage, "/World/Backdrop", "/World/CentreCircle")
-        bars = rooms.look(stage, "bars", texture="bars")
-        warehouse.boxes(stage, "/World/Hall", BACKDROP, look=bars, tile=2.0)
-        warehouse.boxes(
-            stage, "/World/Benches", [((0.2, 1.6, 0.2), (x, y, 0.2)) for x in (-5.4, 5.4) for y in (-2, 2)], look=bars
-        )
-        lines = [((0.04, 4.4, 0.001), (x, -1.0, 0.003)) for x in (-3.6, 3.6)]
-        lines += [((3.6, 0.04, 0.001), (0, y, 0.003)) for y in (-3.4, 0.0)]
-        warehouse.boxes(stage, "/World/Lines", lines, look=rooms.look(stage, "line", (0.85, 0.75, 0.6)))
-        decor.cones(stage, "/World/Cones", [(x, y, 0) for x in (-4.4, 4.4) for y in (-1.5, 1.5)])
+        warehouse.boxes(stage, "/World/School", BACKDROP, look=rooms.look(stage, "school", texture="school"), tile=2.6)
+        for name, (x, y), color in (
+            ("Red", (-1.6, -0.2), (0.6, 0.05, 0.04)),
+            ("Yellow", (0.3, -1.2), (0.85, 0.6, 0.04)),
+            ("Blue", (1.9, 0.4), (0.05, 0.3, 0.65)),
+        ):
+            disc = Solids().ring(0.0, 0.55, (x, y, 0.003)).ring(0.62, 0.7, (x, y, 0.003))
+            disc.write(stage, f"/World/{name}Game", look=rooms.look(stage, f"{name}Paint", color))
+        hopscotch = Solids()
+        for number in range(7):
+            for x in (0.0,) if number % 2 else (-0.25, 0.25):
+                hopscotch.box((0.22, 0.22, 0.001), (x - 3.6, 0.5 * number - 2.6, 0.003))
+        hopscotch.write(stage, "/World/Hopscotch", look=rooms.look(stage, "Hopscotch", (0.8, 0.75, 0.65)))
+        leaves = rooms.look(stage, "Leaves", texture="boxwood")
+        for number, (x, y) in enumerate(((-4.6, 3.6), (4.6, 3.6), (5.2, -0.5))):
+            decor.topiary(stage, f"/World/Tree_{number}", (x, y, 0), 1.8, crown=leaves)
         paint = {
-            "/World/Floor": rooms.look(stage, "grass", texture="court"),
-            "/World/Goal/FrameLook": rooms.look(stage, "crimson", (0.36, 0.02, 0.05)),
-            "/World/Goal/Net": rooms.look(stage, "straw", (0.85, 0.72, 0.35)),
+            "/World/Floor": rooms.look(stage, "grass", texture="asphalt"),
+            "/World/Goal/FrameLook": rooms.look(stage, "azure", (0.03, 0.2, 0.6)),
+            "/World/Goal/Net": rooms.look(stage, "green", (0.02, 0.2, 0.08)),
             "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
         }
         rooms.paint(stage, paint)

@@ -16,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from arena_newton.tasks.open_door import TASK
 from scene_builders import author, decor, rooms, warehouse
+from scene_builders.solids import Solids
 
 POSITION = (-1.614, 2.314, 0.002)
 LEAF_SIZE = (1.0, 0.04, 2.14)
@@ -181,42 +182,71 @@ def _back_room(stage: Usd.Stage) -> None:
     author.quad(stage, "/World/PitStripeSide", 0.06, 0.5, (-1.62, 4.45, 0.005), repeat=(0.5, 4), look=hazard)
 
 
+def _on_panels(stage: Usd.Stage, name: str, height: float, out: float, look: Usd.Prim, tile: float) -> None:
+    """Draw the partition up to `height` in another look, `out` outside its solids [m]; the header if it is as tall."""
+    parts = []
+    for panel, ((hx, hy, hz), (x, y, z)) in _panels().items():
+        if panel != "Header":
+            parts.append(((hx - 0.02, hy + out, height / 2), (x, y, height / 2)))  # ends behind the casing
+        elif height >= PARTITION_HEIGHT:
+            parts.append(((hx, hy + out, hz), (x, y, z)))
+    warehouse.boxes(stage, f"/World/Door/Frame/{name}", parts, look=look, tile=tile)
+
+
 def _semantic_2(folder: Path) -> None:
-    """A hallway: parquet, striped wallpaper, and a door of green boards with a porthole and a brass lever."""
+    """A hotel: blue carpet with diamonds, damask over dark panelling, a numbered mahogany door and a golden bench."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="parquet")
-        rooms.look(stage, "Wall", (0.45, 0.3, 0.12))
-        rooms.look(stage, "Trim", (0.8, 0.78, 0.72))
-        rooms.look(stage, "Rail", (0.2, 0.1, 0.05))
-        rooms.look(stage, "Leaf", texture="door")
-        brass = rooms.look(stage, "Chrome", (0.75, 0.5, 0.12), roughness=0.3)
-        paper = [(np.asarray(half) + (0, 0.001, 0), centre) for half, centre in _panels().values()]
-        look = rooms.look(stage, "Paper", texture="wallpaper")
-        warehouse.boxes(stage, "/World/Door/Frame/Paper", paper, look=look, tile=0.9)
-        leaf, middle = "/World/Door/Leaf", (LEAF_SIZE[0] / 2, 0, 1.55)
+        rooms.look(stage, "Floor", texture="diamonds")
+        rooms.look(stage, "Wall", (0.3, 0.04, 0.08))
+        rooms.look(stage, "Skirting", (0.08, 0.03, 0.02))
+        for name in ("Panel", "Trim"):
+            rooms.look(stage, name, (0.5, 0.34, 0.1))
+        rooms.look(stage, "Rail", (0.07, 0.025, 0.015))
+        rooms.look(stage, "Leaf", texture="mahogany")
+        bright = rooms.look(stage, "Chrome", (0.7, 0.68, 0.62), roughness=0.3)
+        _on_panels(stage, "Damask", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Damask", texture="damask"), 1.0)
+        _on_panels(stage, "Panelling", 0.9, 0.004, rooms.look(stage, "Panelling", (0.09, 0.035, 0.02)), 1.0)
+        leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.002
         rooms.without(stage, f"{leaf}/Mouldings")
-        pane = rooms.look(stage, "Porthole", (0.55, 0.75, 0.85), roughness=0.2)
-        for name, radius, thickness, bound in (("Rim", 0.21, 0.046, brass), ("Pane", 0.17, 0.05, pane)):
-            author.cylinder(stage, f"{leaf}/{name}", radius, thickness, middle, axis="Y", collide=False, look=bound)
+        fields = [((0.16, y, hz), (x, 0, z)) for x in (0.27, 0.73) for hz, z in ((0.3, 0.46), (0.2, 1.72))]
+        warehouse.boxes(stage, f"{leaf}/Fields", fields, look=rooms.look(stage, "Fields", (0.16, 0.045, 0.02)))
+        plate = [((0.09, y + 0.001, 0.05), (0.5, 0, 1.4)), ((0.035, y + 0.003, 0.11), (0.93, 0, 0.95))]
+        warehouse.boxes(stage, f"{leaf}/Plates", plate, look=bright)
+        seat = [((0.5, 0.18, 0.06), (-1.7, -0.28, 0.42))]
+        seat += [((0.03, 0.14, 0.18), (x, -0.28, 0.18)) for x in (-2.1, -1.3)]
+        warehouse.boxes(stage, f"{frame}/Bench", seat, look=rooms.look(stage, "BenchSeat", (0.5, 0.36, 0.1)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A porch: mosaic floor, slate walls, a cream door with stained glass and a dark lever, a mat and plants."""
+    """A clinic: green vinyl with guide lines, white over blue walls, a yellow door with a slim pane and a red lever."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="mosaic")
-        rooms.look(stage, "Wall", (0.5, 0.26, 0.2))
-        rooms.look(stage, "Panel", (0.07, 0.1, 0.15))
-        rooms.look(stage, "Trim", (0.45, 0.27, 0.12))
-        rooms.look(stage, "Leaf", (0.75, 0.68, 0.5))
-        rooms.look(stage, "Chrome", (0.02, 0.02, 0.02))
+        rooms.look(stage, "Floor", texture="vinyl")
+        rooms.look(stage, "Wall", (0.75, 0.73, 0.66))
+        rooms.look(stage, "Skirting", (0.05, 0.2, 0.3))
+        for name in ("Panel", "Trim"):
+            rooms.look(stage, name, (0.1, 0.3, 0.42))
+        rooms.look(stage, "Rail", (0.05, 0.2, 0.3))
+        rooms.look(stage, "Leaf", (0.85, 0.55, 0.06))
+        rooms.look(stage, "Chrome", (0.55, 0.02, 0.02))
+        _on_panels(stage, "Plaster", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Plaster", (0.8, 0.78, 0.72)), 1.0)
+        _on_panels(stage, "Dado", 1.1, 0.004, rooms.look(stage, "Dado", (0.22, 0.45, 0.62)), 1.0)
         leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.002
         rooms.without(stage, f"{leaf}/Mouldings")
-        panes = [((0.13, y, 0.38), (x, 0, 1.5)) for x in (0.22, 0.56)] + [((0.3, y, 0.2), (0.39, 0, 0.5))]
-        warehouse.boxes(stage, f"{leaf}/Glass", panes, look=rooms.look(stage, "Glass", texture="glass"), tile=0.6)
-        mat = rooms.look(stage, "Mat", (0.3, 0.03, 0.06))
-        warehouse.boxes(stage, f"{frame}/Mat", [((0.45, 0.28, 0.002), (0, -0.5, 0.003))], look=mat)
-        for name, x in (("Left", -1.0), ("Right", 1.0)):
-            decor.plant(stage, f"{frame}/{name}Plant", (x, -0.35, 0))
+        steel = rooms.look(stage, "Kick", (0.6, 0.62, 0.64), roughness=0.4)
+        warehouse.boxes(stage, f"{leaf}/Kick", [((0.47, y, 0.16), (0.5, 0, 0.2))], look=steel)
+        pane = [((0.07, y, 0.4), (0.78, 0, 1.6))]
+        warehouse.boxes(stage, f"{leaf}/Pane", pane, look=rooms.look(stage, "Pane", (0.25, 0.5, 0.6), roughness=0.2))
+        rails, opening = Solids(), _OPENING + 0.12
+        for x0, x1 in ((PARTITION_X[0], -opening), (opening, PARTITION_X[1])):
+            rails.tube((x0, -0.09, 0.92), (x1, -0.09, 0.92), 0.02, sides=8)
+        rails.write(stage, f"{frame}/Handrails", look=rooms.look(stage, "Handrail", (0.55, 0.3, 0.12)))
+        line = [((0.06, 2.0, 0.001), (0.3, -2.1, 0.003)), ((0.06, 2.0, 0.001), (-0.3, -2.1, 0.003))]
+        warehouse.boxes(stage, f"{frame}/GuideLines", line, look=rooms.look(stage, "GuideLine", (0.35, 0.1, 0.45)))
+        sign = [((0.14, 0.062, 0.14), (0.95, 0, 1.6))]
+        warehouse.boxes(stage, f"{frame}/Sign", sign, look=rooms.look(stage, "Sign", (0.03, 0.12, 0.5)))
+        decor.stool(
+            stage, f"{frame}/Stool", [(-1.5, -0.35), (-2.1, -0.35)], seat=(0.75, 0.25, 0.1), legs=(0.6, 0.6, 0.6)
+        )
 
 
 def build(folder: Path) -> None:

@@ -9,149 +9,127 @@ from pathlib import Path
 
 import numpy as np
 
-from scene_builders.textures import SIDE, Color, blend, boards, football, generator, noise, write
+from scene_builders.textures import SIDE, Color, blend, football, generator, noise, write
 
 __all__ = ["PATTERNS", "build"]
 
 
-def _weave(low: Color, high: Color, cells: int, grain: tuple[int, int]) -> np.ndarray:
-    """A chequer of `cells` a side whose grain runs along and across in turn, such as parquet and wicker."""
-    rng = generator(f"weave {low} {high}")
-    y, x = np.mgrid[0:SIDE, 0:SIDE] * cells // SIDE
-    along, across = noise(rng, *grain), noise(rng, *grain[::-1])
-    edge = np.mgrid[0:SIDE, 0:SIDE] % (SIDE // cells) < 1
-    return blend(low, high, np.where((x + y) % 2, along, across) * np.where(edge.any(axis=0), 0.3, 1.0))
+def _grain(colors: Sequence[Color], *octaves: tuple[float, int, int]) -> np.ndarray:
+    """Smooth noise through `colors`; an octave is its weight and its cells along height and width."""
+    rng = generator(f"grain {colors[0]}")
+    height = np.sum([weight * noise(rng, rows, columns) for weight, rows, columns in octaves], axis=0)
+    amount = np.round((height - height.min()) / np.ptp(height) * 15) / 15
+    stops = np.linspace(0, 1, len(colors))
+    return np.stack([np.interp(amount, stops, channel) for channel in zip(*colors, strict=True)], -1).astype(np.uint8)
 
 
-def _bands(colors: Sequence[Color], *, slope: int = 0, across: Sequence[Color] = ()) -> np.ndarray:
-    """Stripes of one width each along the height, leaning by whole turns `slope`; `across` mixes in as a plaid."""
+def _bond(
+    rows: int, columns: int, colors: Sequence[Color], joint: Color, stagger: float = 0.5, width: int = 2
+) -> np.ndarray:
+    """Rectangles in drawn colours with joints of `width` [px], every second row shifted by `stagger` of one."""
+    rng = generator(f"bond {rows} {columns} {colors[0]}")
     y, x = np.mgrid[0:SIDE, 0:SIDE]
-    image = np.array(colors)[(x + slope * y) * len(colors) // SIDE % len(colors)]
-    if across:
-        image = (image + np.array(across)[y * len(across) // SIDE]) // 2
-    return image.astype(np.uint8)
-
-
-def _chequer(colors: Sequence[Color], cells: int) -> np.ndarray:
-    """Squares whose colours follow each other along and across."""
-    y, x = np.mgrid[0:SIDE, 0:SIDE] * cells // SIDE
-    return np.array(colors, dtype=np.uint8)[(x + y) % len(colors)]
-
-
-def _cells(rows: int, columns: int, colors: Sequence[Color], *, joint: Color | None = None) -> np.ndarray:
-    """Rectangles in drawn colours, each colour equally often but for the rest, with joints of two pixels."""
-    rng = generator(f"cells {rows} {columns} {colors[0]}")
+    row = y * rows // SIDE
+    x = (x + row % 2 * round(stagger * SIDE / columns)) % SIDE
     order = rng.permutation(rows * columns).reshape(rows, columns) % len(colors)
-    image = np.kron(np.array(colors, dtype=np.uint8)[order], np.ones((SIDE // rows, SIDE // columns, 1), np.uint8))
-    if joint is not None:
-        for start in range(2):
-            image[start :: SIDE // rows] = joint
-            image[:, start :: SIDE // columns] = joint
+    image = np.array(colors, dtype=np.uint8)[order[row, x * columns // SIDE]]
+    image[(y % (SIDE // rows) < width) | (x % (SIDE // columns) < width)] = joint
     return image
 
 
-def _stones(count: int, colors: Sequence[Color], joint: Color, width: float) -> np.ndarray:
-    """Irregular pieces around drawn points in joints of `width` [px]: stained glass, paving, terrazzo."""
-    rng = generator(f"stones {count} {colors[0]}")
-    points = rng.random((count, 2)) * SIDE
-    away = np.abs(np.indices((SIDE, SIDE)).transpose(1, 2, 0)[:, :, None] - points)
-    distance = np.linalg.norm(np.minimum(away, SIDE - away), axis=-1)
-    first, second = np.sort(distance, axis=-1)[..., :2].transpose(2, 0, 1)
-    image = np.array(colors, dtype=np.uint8)[np.argmin(distance, axis=-1) % len(colors)]
-    image[second - first < width] = joint
+def _motifs(
+    ground: Color, rings: Sequence[tuple[float, Color]], cells: int, norm: float = 2, lobes: int = 0, both: bool = True
+) -> np.ndarray:
+    """Nested shapes in the middle of `cells` squares a side and, with `both`, on their corners.
+
+    `rings` are radii and colours, the widest first; shapes of radius 1 touch along a row. Discs have `norm` 2, diamonds
+    1, squares a high one; `lobes` makes a star of so many points.
+    """
+    y, x = (np.mgrid[0:SIDE, 0:SIDE] + 0.5) * cells / SIDE
+    image = np.full((SIDE, SIDE, 3), ground, dtype=np.uint8)
+    for shift in (0.0, 0.5) if both else (0.0,):
+        u, v = (x + shift) % 1 - 0.5, (y + shift) % 1 - 0.5
+        radius = 2 * (np.abs(u) ** norm + np.abs(v) ** norm) ** (1 / norm)
+        radius = radius * (1 + (0.24 * np.sin(lobes * np.arctan2(v, u)) if lobes else 0.0))
+        for reach, color in rings:
+            image[radius < reach] = color
     return image
 
 
-def _flecks(ground: Color, colors: Sequence[Color], fraction: float) -> np.ndarray:
-    """Granulate: grains of two pixels on a ground, a fraction of them coloured."""
-    rng = generator(f"flecks {ground}")
-    grains = rng.random((SIDE // 2, SIDE // 2))
-    shade = blend(ground, tuple(min(255, c + 18) for c in ground), grains, levels=3)  # type: ignore[arg-type]
-    drawn = np.array(colors, dtype=np.uint8)[rng.integers(0, len(colors), grains.shape)]
-    image = np.where((rng.random(grains.shape) < fraction)[..., None], drawn, shade)
-    return image.repeat(2, axis=0).repeat(2, axis=1)
+def _ridges(low: Color, high: Color, count: int) -> np.ndarray:
+    """Upright ribs, such as corduroy and the shell of a suitcase."""
+    across = np.broadcast_to(np.arange(SIDE) * count / SIDE, (SIDE, SIDE))
+    return blend(low, high, 0.5 + 0.5 * np.cos(2 * np.pi * across), levels=8)
 
 
-def _clouds(colors: Sequence[Color], cells: int) -> np.ndarray:
-    """Large soft shapes, one colour each, like a painted wall."""
-    rng = generator(f"clouds {colors[0]}")
-    height = noise(rng, cells, cells)
-    rank = np.argsort(np.argsort(height, axis=None)).reshape(height.shape)
-    return np.array(colors, dtype=np.uint8)[rank * len(colors) // rank.size]
+def _bands(*bands: tuple[int, Color]) -> np.ndarray:
+    """Level bands from above, each its height [px] and colour."""
+    rows = np.repeat(np.array([color for _, color in bands], dtype=np.uint8), [height for height, _ in bands], axis=0)
+    return np.repeat(rows[:, None], SIDE, axis=1)
 
 
-def _turf() -> np.ndarray:
-    """Mown grass: a pale and a dark band, with blades."""
-    rng = generator("turf")
-    blades = 0.5 * noise(rng, 64, 32) + 0.5 * noise(rng, 32, 64)
-    light = np.where(np.arange(SIDE) < SIDE // 2, 0.55, 0.0)
-    return blend((22, 84, 40), (98, 168, 88), 0.45 * blades + light)
+def _facade(plaster: Color, frame: Color, pane: Color, plinth: Color) -> np.ndarray:
+    """A house front: plinth, plaster and one window with a cross bar."""
+    image = _bands((96, plaster), (32, plinth))
+    image[20:76, 30:98] = frame
+    image[24:46, 34:62] = image[24:46, 66:94] = image[50:72, 34:62] = image[50:72, 66:94] = pane
+    return image
 
 
-def _parcel(board: Color, tape: Color, label: Color, ink: Color) -> np.ndarray:
-    """A box's face: board with tape along and across, and a label with lines of print."""
-    image = np.full((SIDE, SIDE, 3), board, dtype=np.uint8)
-    image[54:74] = image[:, 54:74] = tape
-    image[12:46, 80:120] = label
-    image[18:40:6, 84:116] = ink
+def _label(board: Color, foot: Color, label: Color, ink: Color) -> np.ndarray:
+    """A box's face: board, a foot in another colour, and in the middle a label with a frame and two lines."""
+    image = _bands((98, board), (30, foot))
+    image[26:82, 26:102] = ink
+    image[30:78, 30:98] = label
+    image[42:48, 38:90] = image[58:64, 38:76] = ink
     return image
 
 
 PATTERNS: dict[str, dict[str, Callable[[], np.ndarray]]] = {
     "semantic-2": {
-        "turf": _turf,
-        "ball": partial(football, (28, 62, 170), ((244, 244, 240), (244, 244, 240), (214, 44, 40)), (90, 90, 96)),
-        "hoarding": partial(
-            _cells, 2, 4, ((196, 40, 52), (28, 74, 150), (240, 240, 236), (24, 120, 110), (232, 146, 40))
-        ),
-        "lino": partial(_chequer, ((52, 104, 84), (226, 218, 192)), 4),
-        "wallpaper": partial(
-            _bands, ((214, 200, 170), (214, 200, 170), (120, 150, 160), (214, 200, 170), (168, 74, 70), (120, 150, 160))
-        ),
-        "wicker": partial(_weave, (118, 76, 34), (222, 176, 104), 8, (32, 8)),
-        "parcel": partial(_parcel, (54, 96, 168), (226, 226, 222), (240, 214, 150), (60, 40, 40)),
-        "parquet": partial(_weave, (66, 36, 22), (146, 92, 58), 4, (32, 3)),
-        "tartan": partial(
-            _bands,
-            ((150, 30, 40), (150, 30, 40), (24, 60, 70), (150, 30, 40), (232, 206, 150), (24, 60, 70)),
-            across=((150, 30, 40), (24, 60, 70), (150, 30, 40), (150, 30, 40), (232, 206, 150), (24, 60, 70)),
-        ),
-        "runner": partial(
-            _bands, ((236, 222, 190), (40, 110, 120), (236, 222, 190), (208, 96, 50), (60, 50, 80), (208, 96, 50))
-        ),
-        "rubber": partial(_flecks, (40, 40, 44), ((70, 120, 190), (190, 80, 60), (200, 200, 200)), 0.16),
-        "crate": partial(boards, "crate", (150, 104, 60), (214, 168, 110), (70, 44, 24)),
-        "door": partial(boards, "door", (30, 84, 62), (72, 140, 104), (14, 40, 30)),
+        "sand": partial(_grain, ((172, 136, 90), (212, 180, 128), (234, 212, 168)), (1, 12, 5), (0.5, 40, 32)),
+        "sea": partial(_bands, (40, (150, 200, 236)), (12, (226, 236, 240)), (40, (20, 84, 150)), (36, (36, 150, 168))),
+        "ball": partial(football, (16, 104, 110), ((250, 246, 236), (236, 120, 30)), (60, 70, 74)),
+        "linoleum": partial(_grain, ((184, 116, 52), (206, 146, 76), (220, 170, 104)), (1, 3, 7), (0.9, 20, 28)),
+        "mat": partial(_bond, 8, 8, ((18, 92, 74), (22, 100, 80)), (150, 206, 170), 0.0, 1),
+        "books": partial(_bond, 4, 16, ((120, 34, 30), (36, 62, 96), (196, 166, 112), (60, 88, 60)), (34, 22, 16)),
+        "felt": partial(_grain, ((14, 54, 38), (26, 84, 56), (44, 104, 68)), (1, 4, 4), (0.8, 48, 48)),
+        "mahogany": partial(_grain, ((62, 18, 12), (122, 42, 24), (156, 72, 40)), (1, 2, 20), (0.5, 4, 64)),
+        "archive": partial(_label, (120, 140, 160), (84, 104, 126), (238, 232, 214), (40, 44, 60)),
+        "folio": partial(_label, (140, 24, 40), (70, 12, 24), (244, 226, 170), (50, 16, 20)),
+        "damask": partial(_motifs, (104, 24, 44), ((0.8, (176, 126, 62)), (0.5, (120, 34, 52))), 4, lobes=4),
+        "diamonds": partial(_motifs, (24, 40, 92), ((0.5, (202, 164, 76)), (0.34, (150, 40, 50))), 4, norm=1.0),
+        "circles": partial(_motifs, (240, 224, 190), ((0.96, (224, 110, 30)), (0.6, (104, 54, 26))), 4, both=False),
+        "pile": partial(_grain, ((66, 30, 16), (112, 58, 28), (146, 82, 42)), (0.6, 6, 6), (1, 40, 40)),
+        "rug": partial(_motifs, (236, 222, 190), ((0.88, (214, 100, 30)), (0.7, (128, 70, 36))), 1, 6.0, both=False),
+        "corduroy": partial(_ridges, (150, 100, 16), (226, 170, 44), 12),
+        "mover": partial(_label, (244, 240, 226), (190, 50, 40), (110, 118, 50), (244, 240, 226)),
+        "tatami": partial(_bond, 2, 1, ((190, 180, 116), (206, 192, 132)), (30, 44, 70), width=5),
+        "shoji": partial(_bond, 4, 4, ((238, 232, 216), (230, 220, 200)), (74, 44, 26), 0.0, 4),
+        "lounge": partial(_bond, 4, 4, ((66, 50, 118), (84, 62, 140), (52, 64, 130), (98, 70, 148)), (0, 0, 0), 0.0, 0),
+        "glazing": partial(_bond, 1, 2, ((150, 196, 230), (176, 212, 238)), (50, 56, 66), 0.0, 6),
+        "shell": partial(_ridges, (6, 84, 86), (40, 158, 150), 8),
     },
     "semantic-3": {
-        "court": partial(_cells, 4, 4, ((44, 88, 150), (52, 98, 162), (38, 80, 140)), joint=(60, 104, 166)),
-        "ball": partial(football, (110, 30, 130), ((246, 204, 40), (250, 246, 236)), (40, 30, 50)),
-        "bars": partial(boards, "bars", (196, 138, 78), (232, 186, 124), (120, 74, 40)),
-        "terrazzo": partial(
-            _stones, 420, ((232, 226, 214),) * 5 + ((206, 120, 104), (70, 128, 130), (60, 60, 66)), (222, 214, 200), 2.2
-        ),
-        "mural": partial(_clouds, ((232, 188, 160), (206, 110, 92), (70, 106, 120), (238, 214, 150), (64, 70, 96)), 4),
-        "pavers": partial(
-            _stones, 26, ((150, 112, 104), (122, 100, 112), (172, 142, 122), (98, 98, 112)), (66, 62, 64), 2.0
-        ),
-        "glass": partial(
-            _stones,
-            22,
-            ((196, 40, 50), (40, 90, 180), (240, 190, 60), (60, 150, 90), (226, 226, 236)),
-            (24, 22, 24),
-            2.5,
-        ),
-        "mosaic": partial(
-            _cells, 16, 16, ((30, 110, 130), (80, 170, 180), (214, 230, 226), (24, 70, 110)), joint=(196, 196, 188)
-        ),
-        "mats": partial(
-            _cells, 2, 2, ((178, 64, 58), (60, 96, 160), (214, 206, 190), (70, 70, 82)), joint=(40, 40, 44)
-        ),
-        "barrier": partial(_bands, ((36, 70, 150), (236, 236, 232), (36, 70, 150), (196, 60, 120)), slope=1),
-        "gift": partial(_parcel, (150, 32, 84), (236, 190, 60), (150, 32, 84), (244, 226, 232)),
-        "quilt": partial(
-            _cells, 4, 4, ((52, 110, 92), (226, 190, 120), (170, 70, 60), (60, 76, 110)), joint=(236, 228, 212)
-        ),
+        "asphalt": partial(_grain, ((48, 50, 58), (66, 68, 76), (92, 92, 98)), (0.6, 4, 4), (1, 56, 56)),
+        "school": partial(_facade, (236, 216, 160), (250, 250, 246), (70, 104, 140), (150, 70, 56)),
+        "ball": partial(football, (30, 34, 84), ((246, 136, 26),), (250, 240, 220)),
+        "metro": partial(_bond, 8, 4, ((168, 196, 142), (182, 206, 154), (152, 184, 130)), (236, 236, 224)),
+        "quarry": partial(_bond, 8, 8, ((116, 38, 30), (134, 50, 38), (98, 32, 30)), (196, 176, 156), 0.0),
+        "butcher": partial(_bond, 8, 2, ((214, 166, 104), (196, 142, 80), (226, 184, 126)), (130, 84, 44), width=1),
+        "clouds": partial(_grain, ((84, 158, 222), (110, 180, 234), (250, 250, 250)), (1, 3, 4), (0.4, 10, 12)),
+        "puzzle": partial(_bond, 4, 4, ((246, 190, 200), (250, 226, 140), (170, 224, 206)), (250, 250, 250), 0.0),
+        "dots": partial(_motifs, (110, 50, 140), ((0.46, (246, 240, 250)),), 4),
+        "star": partial(_motifs, (8, 150, 160), ((0.8, (252, 224, 80)), (0.36, (226, 60, 80))), 1, 2, 5, False),
+        "vinyl": partial(_grain, ((66, 146, 132), (94, 174, 156), (140, 204, 184)), (0.5, 5, 5), (1, 44, 44)),
+        "zellige": partial(_motifs, (240, 230, 206), ((0.96, (176, 78, 44)), (0.6, (240, 230, 206))), 4, lobes=8),
+        "kilim": partial(_motifs, (186, 58, 44), ((0.74, (240, 214, 160)), (0.5, (40, 90, 84))), 2, norm=1.0),
+        "pouf": partial(_motifs, (236, 226, 208), ((0.78, (30, 60, 140)), (0.44, (236, 226, 208))), 1, 2, 6, False),
+        "track": partial(_grain, ((128, 44, 32), (156, 60, 42), (176, 82, 60)), (0.5, 5, 5), (1, 52, 52)),
+        "blocks": partial(_bond, 8, 4, ((232, 206, 132), (224, 194, 116), (240, 216, 148)), (186, 160, 104)),
+        "gravel": partial(_grain, ((136, 88, 66), (170, 118, 92), (204, 158, 130)), (0.4, 4, 4), (1, 60, 60)),
+        "limestone": partial(_bond, 4, 2, ((214, 196, 150), (198, 178, 132), (226, 210, 170)), (150, 132, 100)),
+        "boxwood": partial(_grain, ((10, 46, 20), (34, 96, 36), (112, 160, 60)), (0.7, 16, 16), (1, 36, 36)),
     },
 }
 """Mode → name → pattern; the file is `patterns/<mode>/<name>.png`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from pxr import Usd
 
 from arena_newton.tasks.pp_box import TASK
-from scene_builders import author, decor, rooms, warehouse
+from scene_builders import author, rooms
 from scene_builders.solids import Solids
 
 __all__ = ["build"]
@@ -116,49 +116,67 @@ def clutter(stage: Usd.Stage) -> None:
     Solids().box((0.08, 0.14, 0.10), (0.0, -5.15, 0.10)).write(stage, "/World/Clutter/CartonLook", look=cardboard)
 
 
+def _on_table(stage: Usd.Stage, things: dict[str, tuple[str, author.Vec, float, author.Vec]]) -> None:
+    """Solid things along the table's far edge: name → kind, half sizes [m], y [m] and colour, linear RGB."""
+    author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
+    for name, (kind, (hx, hy, hz), y, color) in things.items():
+        path, centre, look = f"/World/Clutter/{name}", (0.0, y, hz), rooms.look(stage, name, color)
+        if kind == "box":
+            author.box(stage, path, (hx, hy, hz), centre, look=look)
+        else:
+            author.cylinder(stage, path, hx, 2 * hz, centre, look=look)
+
+
 def _semantic_2(folder: Path) -> None:
-    """A mail room: granulate floor, teal walls, wooden table, blue parcel among books, bottles and a red tray."""
+    """A library: green carpet, walls of books, mahogany table, cream shelf of archive boxes, red box, desk things."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "concrete", texture="rubber")
-        rooms.look(stage, "charcoal", (0.05, 0.2, 0.2))
-        rooms.look(stage, "bench_top", (0.48, 0.3, 0.15))
-        rooms.look(stage, "upright", (0.7, 0.2, 0.02))
-        rooms.look(stage, "deck", (0.3, 0.3, 0.31))
-        rooms.look(stage, "cardboard", texture="crate")
-        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "parcel", texture="parcel")})
-        author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
-        green = rooms.look(stage, "bottle", (0.02, 0.22, 0.08), roughness=0.2)
-        for index, y in enumerate((-5.9, -5.7, -4.1)):
-            author.cylinder(stage, f"/World/Clutter/Bottle_{index}", 0.04, 0.2, (0.0, y, 0.1), look=green)
-        author.box(stage, "/World/Clutter/Books", (0.08, 0.13, 0.06), (0.0, -4.5, 0.06), visual=False)
-        for index, color in enumerate(((0.55, 0.1, 0.1), (0.8, 0.7, 0.5), (0.1, 0.15, 0.4))):
-            book = [((0.08 - 0.006 * index, 0.13 - 0.01 * index, 0.019), (0.0, -4.5, 0.02 + 0.04 * index))]
-            warehouse.boxes(stage, f"/World/Clutter/Book_{index}", book, look=rooms.look(stage, f"book_{index}", color))
-        tray = rooms.look(stage, "tray", (0.6, 0.05, 0.05))
-        author.box(stage, "/World/Clutter/Tray", (0.08, 0.16, 0.03), (0.0, -5.2, 0.03), look=tray)
+        rooms.look(stage, "concrete", texture="felt")
+        rooms.look(stage, "charcoal", texture="books")
+        rooms.look(stage, "bench_steel", (0.1, 0.035, 0.02))
+        rooms.look(stage, "upright", (0.75, 0.68, 0.5))
+        rooms.look(stage, "deck", (0.3, 0.16, 0.06))
+        rooms.look(stage, "plinth", (0.2, 0.1, 0.04))
+        rooms.look(stage, "cardboard", texture="archive")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "folio", texture="folio")})
+        top = rooms.look(stage, "mahogany", texture="mahogany")
+        rooms.bench_cover(stage, "/World/Table", TABLE_LOW, TABLE_HIGH, look=top, tile=0.9)
+        things: dict[str, tuple[str, author.Vec, float, author.Vec]] = {
+            "GlobeFoot": ("round", (0.08, 0.08, 0.03), -5.85, (0.35, 0.2, 0.06)),
+            "CardIndex": ("box", (0.08, 0.14, 0.07), -5.45, (0.5, 0.3, 0.12)),
+            "PaperTray": ("box", (0.08, 0.11, 0.02), -4.95, (0.85, 0.85, 0.8)),
+            "LampFoot": ("round", (0.06, 0.06, 0.12), -4.55, (0.6, 0.42, 0.1)),
+            "InkPot": ("round", (0.035, 0.035, 0.04), -4.2, (0.02, 0.03, 0.12)),
+        }
+        _on_table(stage, things)
+        author.xform(stage, "/World/Clutter/Globe", (0.0, -5.85, 0.17))
+        Solids().ball(0.11).write(stage, "/World/Clutter/Globe/Ball", look=rooms.look(stage, "Globe", (0.06, 0.3, 0.5)))
+        shade = Solids().tube((-0.05, -4.68, 0.29), (-0.05, -4.42, 0.29), 0.07, sides=16)
+        shade.write(stage, "/World/Clutter/LampShade", look=rooms.look(stage, "LampShade", (0.03, 0.3, 0.1)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A shop: paved floor, painted walls, pale table, wrapped gift among pots of plants, a bowl and a bread bin."""
+    """A toy shop: pastel mats, a sky with clouds, lemon table, red and white shelf of dotted boxes, box with a star."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "concrete", texture="pavers")
-        rooms.look(stage, "charcoal", texture="mural")
-        rooms.look(stage, "bench_top", (0.62, 0.66, 0.6))
-        rooms.look(stage, "bench_steel", (0.2, 0.05, 0.1))
-        rooms.look(stage, "upright", (0.04, 0.2, 0.1))
-        rooms.look(stage, "deck", (0.45, 0.3, 0.16))
-        rooms.look(stage, "cardboard", texture="quilt")
-        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "gift", texture="gift")})
-        author.xform(stage, "/World/Clutter", (0, 0, rooms.BENCH_TOP))
-        for index, y in enumerate((-5.85, -4.05)):
-            author.cylinder(stage, f"/World/Clutter/Pot_{index}", 0.05, 0.1, (0.0, y, 0.05), visual=False)
-            decor.plant(stage, f"/World/Clutter/Plant_{index}", (0.0, y, 0.0), 0.3)
-        bowl = rooms.look(stage, "bowl", (0.08, 0.3, 0.5), roughness=0.3)
-        author.cylinder(stage, "/World/Clutter/Bowl", 0.09, 0.05, (0.0, -5.4, 0.025), look=bowl)
-        tin = rooms.look(stage, "bread_bin", (0.75, 0.6, 0.2))
-        author.box(stage, "/World/Clutter/BreadBin", (0.07, 0.15, 0.08), (0.0, -4.5, 0.08), look=tin)
-        jar = rooms.look(stage, "jar", (0.75, 0.75, 0.78))
-        author.cylinder(stage, "/World/Clutter/Jar", 0.05, 0.16, (0.0, -5.1, 0.08), look=jar)
+        rooms.look(stage, "concrete", texture="puzzle")
+        rooms.look(stage, "charcoal", texture="clouds")
+        rooms.look(stage, "bench_top", (0.85, 0.72, 0.12))
+        rooms.look(stage, "bench_steel", (0.75, 0.75, 0.74))
+        rooms.look(stage, "upright", (0.62, 0.03, 0.04))
+        rooms.look(stage, "deck", (0.8, 0.8, 0.78))
+        rooms.look(stage, "plinth", (0.62, 0.03, 0.04))
+        rooms.look(stage, "cardboard", texture="dots")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "star", texture="star")})
+        things: dict[str, tuple[str, author.Vec, float, author.Vec]] = {
+            "Drum": ("round", (0.085, 0.085, 0.07), -5.85, (0.65, 0.04, 0.05)),
+            "Engine": ("box", (0.05, 0.12, 0.05), -5.45, (0.03, 0.2, 0.5)),
+            "Blocks": ("box", (0.07, 0.07, 0.07), -5.05, (0.1, 0.45, 0.12)),
+            "Tower": ("round", (0.06, 0.06, 0.11), -4.55, (0.75, 0.3, 0.03)),
+            "Tin": ("box", (0.06, 0.09, 0.05), -4.15, (0.45, 0.1, 0.45)),
+        }
+        _on_table(stage, things)
+        white = Solids().box((0.045, 0.045, 0.045), (0.0, -5.05, 0.185), yaw=0.5)
+        white.tube((0.0, -5.38, 0.1), (0.0, -5.38, 0.17), 0.025).tube((0.0, -5.85, 0.06), (0.0, -5.85, 0.08), 0.088)
+        white.write(stage, "/World/Clutter/Trim", look=rooms.look(stage, "Trim", (0.85, 0.8, 0.65)))
 
 
 def build(folder: Path) -> None:

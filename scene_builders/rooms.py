@@ -16,6 +16,7 @@ from scene_builders.solids import Solids
 __all__ = [
     "SEMANTICS",
     "bench",
+    "bench_cover",
     "bind_in",
     "contact",
     "edit",
@@ -34,6 +35,8 @@ SEMANTICS = "semantics"
 
 BENCH_TOP = 0.745
 """Upper surface of the benches [m] (measured in the original's clips; both desk scenes use the same bench)."""
+BENCH_TOP_HALF = 0.02
+"""Half thickness of their tops [m]."""
 
 
 def task_stage(folder: Path, task: TaskSpec, *, eye: Vec, gaze: Vec) -> Usd.Stage:
@@ -271,7 +274,7 @@ def bench(stage: Usd.Stage, path: str, low: Vec, high: Vec, *, solref: Vec | Non
 
     `solref` sets the contact stiffness of the top (the hammer needs a stiff one).
     """
-    top, leg = 0.04, 0.03
+    top, leg = 2 * BENCH_TOP_HALF, 0.03
     (x0, y0), (x1, y1) = low, high
     cx, cy, hx, hy = (x0 + x1) / 2, (y0 + y1) / 2, (x1 - x0) / 2, (y1 - y0) / 2
     pale = author.material(stage, "/World/Looks/bench_top", (0.52, 0.52, 0.50))
@@ -295,3 +298,9 @@ def bench(stage: Usd.Stage, path: str, low: Vec, high: Vec, *, solref: Vec | Non
     for sx in (-1, 1):
         trim.box((0.012, hy - 0.05, 0.05), (sx * (hx - 0.05), 0, BENCH_TOP - top - 0.05))
     trim.write(stage, f"{path}/Apron", look=black)
+
+
+def bench_cover(stage: Usd.Stage, path: str, low: Vec, high: Vec, *, look: Usd.Prim, tile: float) -> None:
+    """A textured board drawn 1 mm outside the top of the `bench` at `path`, of the same corners [m]."""
+    half = (*(np.subtract(high, low) / 2 + 0.001), BENCH_TOP_HALF + 0.001)
+    Solids().box(half, (0, 0, BENCH_TOP - BENCH_TOP_HALF), tile=tile).write(stage, f"{path}/Cover", look=look)

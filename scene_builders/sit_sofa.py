@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd
 
+from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.sit_sofa import TASK
 from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
@@ -110,35 +111,44 @@ def _look(stage: Usd.Stage, name: str, color: author.Vec, texture: str | None = 
 
 
 def _semantic_2(folder: Path) -> None:
-    """A parlour: parquet, striped wallpaper and rug, a tartan sofa, a walnut table and blue parcels."""
+    """The seventies: brown pile, circles on the walls, a mustard sofa, an avocado table, a framed rug, a vase."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="parquet")
-        rooms.look(stage, "Wall", texture="wallpaper")
-        rooms.look(stage, "Carpet", texture="runner")
-        rooms.look(stage, "Sofa", texture="tartan")
-        rooms.look(stage, "Table", (0.3, 0.15, 0.06))
-        rooms.look(stage, "Cardboard", texture="parcel")
+        rooms.look(stage, "Floor", texture="pile")
+        rooms.look(stage, "Wall", texture="circles")
+        rooms.look(stage, "Skirting", (0.16, 0.07, 0.03))
+        rooms.look(stage, "Sofa", texture="corduroy")
+        rooms.look(stage, "Feet", (0.2, 0.09, 0.03))
+        rooms.look(stage, "Table", (0.2, 0.27, 0.04))
+        rooms.look(stage, "Cardboard", texture="mover")
         rooms.without(stage, *(f"/World/{name}/Tape" for name in CARTONS))
+        rug = rooms.look(stage, "Carpet", texture="rug")
+        author.quad(stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(1, 1), look=rug)
+        vase = Solids().tube((-1.85, -1.35, 0), (-1.85, -1.35, 0.5), 0.12, taper=1.5, sides=16)
+        vase.tube((-1.85, -1.35, 0.5), (-1.85, -1.35, 0.75), 0.18, taper=0.4, sides=16)
+        vase.write(stage, "/World/Vase", look=rooms.look(stage, "Vase", (0.7, 0.62, 0.45)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A lounge: terrazzo, blush walls, a round rug, a green sofa with cushions, a teal table, gifts, plant and lamp."""
+    """A riad: star tiles, cobalt walls over ochre, a raspberry sofa with bolsters, a brass table, kilim and poufs."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="terrazzo")
-        rooms.look(stage, "Wall", (0.6, 0.38, 0.32))
-        rooms.look(stage, "Skirting", (0.3, 0.14, 0.1))
-        rooms.look(stage, "Sofa", (0.04, 0.2, 0.13))
-        rooms.look(stage, "Table", (0.03, 0.24, 0.3))
-        rooms.look(stage, "Cardboard", texture="gift")
-        rooms.without(stage, "/World/Carpet", *(f"/World/{name}/Tape" for name in CARTONS))
-        rug = Solids().ring(0.0, 1.45, (-3.25, -0.15, 0.004))
-        rug.write(stage, "/World/Rug", look=rooms.look(stage, "Rug", texture="quilt"))
-        for name, x, color in (("Left", -3.96, (0.75, 0.45, 0.06)), ("Right", -2.6, (0.7, 0.2, 0.25))):
-            pillow, centre = f"Pillow{name}", (x, SEAT_Y[0] + 0.09, SEAT_Z[1] + 0.19)
-            look = rooms.look(stage, pillow, color)
-            warehouse.rounded_box(stage, f"/World/Sofa/{pillow}", (0.19, 0.08, 0.19), centre, radius=0.07, look=look)
-        decor.plant(stage, "/World/Plant", (-1.75, -1.5, 0), 1.1)
-        decor.lamp(stage, "/World/Lamp", (-4.8, -1.4, 0))
+        rooms.look(stage, "Floor", texture="zellige")
+        rooms.look(stage, "Wall", (0.04, 0.08, 0.5))
+        rooms.look(stage, "Skirting", (0.62, 0.36, 0.1))
+        rooms.look(stage, "Sofa", (0.5, 0.02, 0.14))
+        rooms.look(stage, "Feet", (0.6, 0.42, 0.1))
+        rooms.look(stage, "Table", (0.62, 0.4, 0.08))
+        rooms.look(stage, "Cardboard", texture="pouf")
+        rooms.without(stage, *(f"/World/{name}/Tape" for name in CARTONS))
+        rug = rooms.look(stage, "Carpet", texture="kilim")
+        author.quad(stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(2, 1.5), look=rug)
+        ochre = rooms.look(stage, "Ochre", (0.62, 0.36, 0.1))
+        decor.dado(stage, "/World/Dado", *ROOM, 0.7, look=ochre)
+        for name, x, color in (("Left", -4.0, (0.75, 0.5, 0.08)), ("Right", -2.55, (0.02, 0.3, 0.3))):
+            start, end = ((x + side, SEAT_Y[0] + 0.1, SEAT_Z[1] + 0.1) for side in (-0.15, 0.15))
+            bolster = Solids().tube(start, end, 0.1, sides=16)
+            bolster.write(stage, f"/World/Sofa/Bolster{name}", look=rooms.look(stage, f"Bolster{name}", color))
+        crown = rooms.look(stage, "Crown", texture="boxwood")
+        decor.topiary(stage, "/World/Tree", (-1.8, -1.6, 0), 1.3, crown=crown)
 
 
 def build(folder: Path) -> None:

@@ -116,41 +116,50 @@ def _cover(stage: Usd.Stage, look: Usd.Prim, tile: float) -> None:
 
 
 def _semantic_2(folder: Path) -> None:
-    """A depot: dark granulate, teal walls, wooden crates, a filled yellow field with a cross, and a traffic cone."""
+    """An airport: violet carpet, glass walls, ribbed teal cases, a golden hatched field and a blue board."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="rubber")
-        rooms.look(stage, "Wall", (0.04, 0.22, 0.22))
-        _cover(stage, rooms.look(stage, "Crate", texture="crate"), 0.5)
-        frame, (cx, cy), half = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2
-        panel = (f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline"))
-        rooms.without(stage, *panel)
-        yellow, white = rooms.look(stage, "OutlineYellow", YELLOW), rooms.look(stage, "White", (0.9, 0.9, 0.88))
-        warehouse.boxes(stage, f"{frame}/Field", [((half, half, 0.001), (cx, cy, 0.002))], look=yellow)
-        cross = [((half, 0.03, 0.001), (cx, cy, 0.003)), ((0.03, half, 0.001), (cx, cy, 0.003))]
-        warehouse.boxes(stage, f"{frame}/Cross", cross, look=white)
-        decor.cones(stage, f"{frame}/Cone", [(cx, cy + half - 0.02, 0)])
+        rooms.look(stage, "Floor", texture="lounge")
+        rooms.look(stage, "Wall", texture="glazing")
+        rooms.look(stage, "Skirting", (0.12, 0.14, 0.18))
+        _cover(stage, rooms.look(stage, "Case", texture="shell"), 0.8)
+        frame, (cx, cy), half, s = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2, OUTLINE_STRIPE / 2
+        rooms.without(stage, *(f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline")))
+        field = Solids()
+        for k in (-1, 1):
+            field.box((half, s, 0.001), (cx, cy + k * (half - s), 0.002))
+            field.box((s, half, 0.001), (cx + k * (half - s), cy, 0.002))
+        for t in np.linspace(-0.55, 0.55, 4):  # bars that lean by 45 degrees, between the sides of the square
+            reach = half - s - abs(t) / 2
+            field.box((np.sqrt(2) * reach, 0.03, 0.001), (cx - t / 2, cy + t / 2, 0.003), yaw=np.pi / 4)
+        field.write(stage, f"{frame}/Field", look=rooms.look(stage, "OutlineYellow", (0.9, 0.56, 0.01)))
+        y = cy + half - 0.02
+        board = [((0.15, 0.05, 0.26), (-0.05, y, 0.345)), ((0.17, 0.07, 0.04), (-0.05, y, 0.04))]
+        warehouse.boxes(stage, f"{frame}/Board", board, look=rooms.look(stage, "Board", (0.03, 0.1, 0.45)))
+        letter = [((0.025, 0.052, 0.09), (-0.05, y, 0.3)), ((0.03, 0.052, 0.03), (-0.05, y, 0.47))]
+        warehouse.boxes(stage, f"{frame}/Letter", letter, look=rooms.look(stage, "Letter", (0.9, 0.9, 0.9)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A yard: paving, blush walls, barriers striped in three hues, yellow corners around a diamond, and a flag."""
+    """A formal garden: gravel, limestone walls, clipped hedges in troughs, lemon paving stones and a small tree."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="pavers")
-        rooms.look(stage, "Wall", (0.6, 0.38, 0.32))
-        _cover(stage, rooms.look(stage, "Barrier", texture="barrier"), 0.8)
+        rooms.look(stage, "Floor", texture="gravel")
+        rooms.look(stage, "Wall", texture="limestone")
+        rooms.look(stage, "Skirting", (0.28, 0.22, 0.15))
+        hedge = rooms.look(stage, "Hedge", texture="boxwood")
+        _cover(stage, hedge, 0.6)
+        trough = rooms.look(stage, "Trough", (0.2, 0.24, 0.3))
+        for name in OBSTACLES:
+            hx, hy, hz = 0.5 * np.asarray(BEAM_SIZE if name.startswith("Beam") else BLOCK_SIZE)
+            foot = ((hx + 0.002, hy + 0.002, 0.05), (0, 0, 0.05 - (hz if name.startswith("Beam") else 0.0)))
+            warehouse.boxes(stage, f"/World/{name}/Trough", [foot], look=trough)
         frame, (cx, cy), half = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2
-        panel = (f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline"))
-        rooms.without(stage, *panel)
-        yellow, long, wide = rooms.look(stage, "OutlineYellow", YELLOW), half / 3, 0.04
-        corners = Solids().box((0.2, 0.2, 0.001), (cx, cy, 0.003), yaw=np.pi / 4)
-        for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            corners.box((long, wide, 0.001), (cx + sx * (half - long), cy + sy * (half - wide), 0.002))
-            corners.box((wide, long, 0.001), (cx + sx * (half - wide), cy + sy * (half - long), 0.003))
-        corners.write(stage, f"{frame}/Corners", look=yellow)
-        y = cy + half - 0.02
-        pole = Solids().tube((cx, y, 0), (cx, y, 0.85), 0.02).box((0.1, 0.1, 0.02), (cx, y, 0.02))
-        pole.write(stage, f"{frame}/Pole", look=rooms.look(stage, "Pole", (0.05, 0.05, 0.06)))
-        flag = Solids().box((0.26, 0.006, 0.17), (cx + 0.26, y, 0.66))
-        flag.write(stage, f"{frame}/Flag", look=rooms.look(stage, "Flag", texture="mural"))
+        rooms.without(stage, *(f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline")))
+        stones, step = Solids(), 2 * half / 3
+        for column, row in np.ndindex(3, 3):
+            stone = (step / 2 - (0.0 if (column + row) % 2 else 0.015),) * 2
+            stones.box((*stone, 0.001), (cx + (column - 1) * step, cy + (row - 1) * step, 0.002))
+        stones.write(stage, f"{frame}/Stones", look=rooms.look(stage, "OutlineYellow", (0.92, 0.86, 0.16)))
+        decor.topiary(stage, f"{frame}/Tree", (-0.05, cy + half - 0.02, 0), 0.75, crown=hedge)
 
 
 def build(folder: Path) -> None:

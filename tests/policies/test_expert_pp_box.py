@@ -192,7 +192,7 @@ def test_the_box_is_moved_among_other_clutter():
     """An episode of a held-out mode, with other things on the table, ends with the box on the shelf."""
     env = ArenaEnv("pp_box", tracker=trackers.get("twist2"), worlds=1, engine="mujoco", threads=1, mode=HELD_OUT[0])
     (result,) = Rollout(env, policies.get("expert"), episodes(env, 5), max_steps=1600).run()
-    assert env.scene.geom_ids("/World/Clutter/Books") and result.outcome == "success"
+    assert any(label.startswith("/World/Clutter/") for label in env.scene.geom_labels) and result.outcome == "success"
 
 
 def test_an_episode_does_not_depend_on_its_world(twist2, played):
