@@ -51,6 +51,8 @@ class FactorFit(NamedTuple):
     """Logarithms of the factors, then the latency [ticks], shape [parameters + 1]."""
     misfit: float
     """Square of the residuals per degree of freedom, each in its standard deviation: 1 where noise alone is left."""
+    surprise: float
+    """Standard deviations by which noise alone has a smaller misfit; one above 2.5 tells a wrong minimum (or model)."""
     information: torch.Tensor
     """Fisher's information of the numbers before this step, with what was known of them at first: the roots of the
     diagonal of its inverse are the standard errors to expect, shape [parameters + 1, parameters + 1]."""
@@ -118,7 +120,7 @@ class Windows:
         """
         prior, every = torch.diag(spread**-2) if spread.ndim == 1 else spread, [*enumerate(_GAINS)]
         moves = numbers.new_zeros(len(self._begin), 2 * self._model.nv)
-        found = FactorFit(numbers, torch.inf, prior, moves, torch.ones(len(moves), dtype=torch.bool))
+        found = FactorFit(numbers, torch.inf, torch.inf, prior, moves, torch.ones(len(moves), dtype=torch.bool))
         for part, gain in every[spread.ndim - 1 :] if starts else [(0, _GAINS[-1])]:
             begun = self._sorted(found) if part > 0 else found
             for found in self._descend(begun, numbers, prior, iterations, gain, starts=part > 0):
@@ -180,7 +182,8 @@ class Windows:
             numbers, moves, damping = tried, moved, max(damping / 4.0, 1e-4)
             free = after[kept].numel() - len(numbers) - int(kept.sum()) * by_start.shape[2]
             misfit = float(after[kept].sum()) / free
-            yield FactorFit(numbers, misfit, information, moves, kept)
+            surprise = (misfit - 1.0) * (free / 2.0) ** 0.5  # squares of noise have the variance 2
+            yield FactorFit(numbers, misfit, surprise, information, moves, kept)
             if gained < least * max(misfit, 1.0) and settled <= 0.1 * float(own_loss[~kept].sum()):
                 return
 

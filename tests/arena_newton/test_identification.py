@@ -65,6 +65,10 @@ def test_a_robot_is_known_from_windows(physics, recorded):
     assert (errors < 4.0 * torch.linalg.inv(last.information).diagonal().sqrt()).all(), errors
     noisy = len(physics.scene.robot.joint_qvel) / 49  # the pelvis and the fingers are as exact as the step itself
     assert errors.max() < 0.01 and last.misfit == pytest.approx(noisy, abs=0.15)
+    assert last.surprise < -5.0  # fewer numbers are noisy than it is told
+    halved = recorded._replace(noise=recorded.noise / 2.0)  # twice the noise that it is told: nothing explains it
+    *_, wrong = Windows(physics, halved, NAMES, ticks=7).fit(last.numbers, last.information)
+    assert wrong.surprise > 5.0
     *_, on = windows.fit(last.numbers, last.information)  # an earlier fit's knowledge counts as a measurement
     assert (on.information.diagonal() > 1.5 * last.information.diagonal()).all()
     assert windows.misfit(TRUTH) < windows.misfit(guess)
