@@ -19,7 +19,7 @@ from arena_newton.eval.__main__ import main
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MOST_LINES = 60
-LONGER = {"finetune": 245, "fit_motion": 65, "identify": 160, "slopes": 75, "word_agent": 123}
+LONGER = {"finetune": 245, "fit_motion": 65, "identify": 162, "slopes": 75, "word_agent": 123}
 """Example of more lines → their number: three methods, or a method and its peer, on one problem; a whole agent."""
 RUN = "--task boxing --tracker twist2 --seeds 0 --repeats 1 --engine mujoco --max-steps 4 --out OUT".split()
 SHORT: dict[str, list[str]] = {
@@ -49,7 +49,8 @@ SAYS = {
     "finetune": r"(gradient  error 0\.\d+ rad .*\n){2,}(PPO .* s\n){2,}(ES .* s\n){2,}",
     "fit_motion": r"(gradient  misfit 0\.\d+ .* s\n){2}(CEM       misfit \d\.\d+ .* s\n)+",
     "identify": (
-        r"((fit  misfit .*\n)+.*: two standard errors are \d+\.\d %\n){2}singular values:( \d+){18}\n"
+        r"((fit  misfit .*\n)+dropped: the misfit is \d+\.\d standard .*\n){2}fit  misfit .*\n"
+        r"singular values:( \d+){18}\n"
         r"(.* standard error .* %\n){18}(CEM  misfit .* s\n)+\| robot .*\n.*\n\| 0 \| 2 \| .* s \|\n"
     ),
     "first_episode": r"Kick the soccer ball into the goal\. timeout after 0.2 s .*\n.*\n +0.0 s  approach\n",
