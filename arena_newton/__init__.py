@@ -54,7 +54,8 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 if (_CHECKOUT / "pyproject.toml").is_file() and (_CHECKOUT / "kernels").is_dir():
     sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != _CHECKOUT]
 
-_IMPORTED = sys.orig_argv[sys.orig_argv.index("-m") + 1] if sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv else ""
+_IMPORTED = "".join(sys.orig_argv[sys.orig_argv.index("-m") + 1 :][:1]) if "-m" in sys.orig_argv[:-1] else ""
+_IMPORTED *= sys.argv[:1] == ["-m"]
 """Module that `python -m` is about to run."""
 
 
@@ -65,7 +66,7 @@ def leave(number: int, frame: object) -> None:
 
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler and (
-    Path(sys.argv[0]).name == "arena-newton"
+    Path("".join(sys.argv[:1])).name == "arena-newton"
     or (_CHECKOUT.joinpath(*_IMPORTED.split("."), "__main__.py").is_file() and _IMPORTED.startswith("arena_newton"))
 ):
     signal.signal(signal.SIGINT, leave)

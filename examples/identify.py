@@ -87,6 +87,8 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=20, help="most steps of each descent of the fit")
     parser.add_argument("--measured-starts", action="store_true", help="fit no starts, as the search does")
     args = parser.parse_args()
+    if min(args.windows, args.most, args.iterations) < 1:
+        parser.error("--windows, --most and --iterations are at least 1")
     torch.set_num_threads(1)
     rows = [identified(seed, args) for seed in args.seeds]
     print("| robot | windows | fit: mean, largest error | after | CEM: mean, largest error | after |")

@@ -186,7 +186,7 @@ def _play(
             for spec, acts in ((f"replay:{actions}", True), (STANDING, False)):
                 if chosen := tuple(one for one in mine if bool(wanted[_key(one)].steps) is acts):
                     config = dataclasses.replace(through(plan, tracker, chosen), policy=spec)
-                    config, player = check_parts(config, made)
+                    config, player = check_parts(config, made, replayed=True)
                     ended.callback(player.close)
                     parts.append((tracker, chosen, config, player))
         for tracker, chosen, config, player in parts:

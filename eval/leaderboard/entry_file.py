@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
+from unicodedata import category
 
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import CONSISTENT, LEVELS, SELF_REPORTED
@@ -31,7 +32,9 @@ _DATE = re.compile(r"\d{4}-(?:0[1-9]|1[0-2])(?:-(?:0[1-9]|[12]\d|3[01]))?")
 Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(_DATE.fullmatch(v)))]
 Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]
 Level = Annotated[str, Known(lambda: tuple(LEVELS))]
-Visible = Annotated[str, Fit("a name that can be read", lambda v: is_name(v) and v == plain(v))]
+Visible = Annotated[
+    str, Fit("a name that can be read", lambda v: is_name(v) and v == plain(v) and "Cf" not in map(category, v))
+]
 """Name without characters that no one sees: with one it would look like another's."""
 Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v))]
 

@@ -109,8 +109,13 @@ def _played(folder: ResultsFolder, factories: Factories) -> bool:
         return _play(config, folder, factories, policy, viewer, command(folder, "resume"))
 
 
-def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Policy]:
+def check_parts(config: RunConfig, factories: Factories, *, replayed: bool = False) -> tuple[RunConfig, Policy]:
     """Build trackers and policy and check plan and layers, so that wrong input shows before the first episode.
+
+    Args:
+        config: The run.
+        factories: What makes its parts.
+        replayed: True for actions of a policy that may have seen pictures, whatever they are played by.
 
     Returns:
         The configuration with what they say of themselves, and the policy.
@@ -127,7 +132,7 @@ def check_parts(config: RunConfig, factories: Factories) -> tuple[RunConfig, Pol
             factories.check_variant(layer, task)
     config = config.with_parts(made, policy)
     for mode in config.flags.mode:
-        if not config.cameras and any(modes.get(mode).dynamics.get("picture_noise", ())):
+        if not (replayed or config.cameras) and any(modes.get(mode).dynamics.get("picture_noise", ())):
             raise InputError(f"--mode {mode}: picture_noise, but the policy wants no picture")
     late, chunk = config.flags.latency_ticks, getattr(policy, "chunk_size", 1)
     if 1 < chunk <= late:  # of one that does not say it, 1, the first chunk will show

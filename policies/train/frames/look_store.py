@@ -22,8 +22,8 @@ from arena_newton.policies.train.frames.frame_store import FrameStore, free_memo
 
 __all__ = ["LookStore", "load_looks"]
 
-GOAL_EVERY = 20
-"""Frames of a scene of which one is read for the mean colour of its goal."""
+GOAL_FRAMES = 200
+"""Most frames of a scene that are read for the mean colour of its goal."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,8 @@ def load_looks(
     kept, picture = torch.from_numpy(np.stack(chances)).to(device), store.picture.cpu().numpy()
     colours = []
     for one in range(len(chances)):
-        shown = np.flatnonzero((table == one) & (number >= 0) & (back == 0))[::GOAL_EVERY]
+        shown = np.flatnonzero((table == one) & (number >= 0) & (back == 0))
+        shown = shown[:: -(-len(shown) // GOAL_FRAMES) or 1]
         shapes = stored[torch.from_numpy(number[shown]).to(device)][..., 0]
         seen = store.pictures[torch.from_numpy(picture[shown]).to(device)]
         colours.append(unlike(goal_colour(seen, shapes, kept[one])))

@@ -160,6 +160,7 @@ def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
     [
         ({"name": ""}, 'name is "", expected a name'),
         ({"name": "Ours\u200b"}, "expected a name that can be read"),
+        ({"name": "Ours\u00ad"}, "expected a name that can be read"),
         ({"date": "yesterday"}, "date is"),
         ({"date": "2026-13-01"}, "date is"),
         ({"training_data": "secret"}, "training_data is"),

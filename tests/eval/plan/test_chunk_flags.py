@@ -16,6 +16,7 @@ from arena_newton.eval.folders.results import RunRecord, load_run
 from arena_newton.eval.plan.config import recording_run, resolve
 from arena_newton.eval.plan.options import RecordOptions, RunOptions
 from arena_newton.eval.play.recording import disturbance_of, facts_of
+from arena_newton.eval.play.run import check_parts
 from arena_newton.eval.reports.wording import replay_command
 from arena_newton.eval.tables.run_table import joint_table
 from arena_newton.interfaces import Chunk
@@ -46,6 +47,13 @@ def test_flags_that_contradict_are_refused(tmp_path, capsys, flags, says):
     """One line that names the flag, exit code 2, and no folder."""
     assert run(tmp_path / "out", *flags) == 2
     assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_actions_are_replayed_in_a_mode_with_noise_of_pictures():
+    """A replay wants no picture; the policy whose actions it has did."""
+    options = RunOptions(task=("boxing",), seeds=(0,), repeats=1, engine="mujoco", mode=("base+picture_noise=2",))
+    config, _ = check_parts(resolve(options), factories(), replayed=True)
+    assert not config.cameras
 
 
 def test_a_chunk_that_shows_to_be_too_short_stops_the_run(tmp_path, capsys):
