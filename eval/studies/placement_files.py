@@ -18,7 +18,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.folders.run_folder import setting
 from arena_newton.eval.plan.episode_plan import Episode
 from arena_newton.eval.records.identity import differing_key
-from arena_newton.eval.records.journal import StorageError, write_atomic
+from arena_newton.eval.records.journal import OUTCOMES, StorageError, write_atomic
 from arena_newton.eval.reports.progress import Progress
 from arena_newton.eval.studies.placed_play import PlacedEpisode, PlacedWorlds
 from arena_newton.eval.studies.placement_axes import Axis
@@ -176,9 +176,14 @@ class _PlacedRows:
 
     def _read(self) -> None:
         """Rows of an interrupted study but for one that was not written whole; errors are played again."""
-        whole, _, _ = self._path.read_text(encoding="utf-8").rpartition("\n")
-        head, *rows = csv.reader(whole.splitlines())
-        if head != self._head() or any(len(row) != len(head) for row in rows):
+        try:
+            whole, _, _ = self._path.read_text(encoding="utf-8").rpartition("\n")
+            head, *rows = csv.reader(whole.splitlines())
+            fits = head == self._head() and self._path.with_suffix(".json").exists()
+            fits = fits and all(len(row) == len(head) and _is_result(*row[-4:]) for row in rows)
+        except (ValueError, csv.Error):  # neither text nor numbers
+            fits = False
+        if not fits:
             raise InputError(f"{self._path}: is not what a study of placements wrote; name another folder")
         self._kept = {tuple(row[:-4]): row for row in rows if row[-4] != "error"}
 
@@ -194,6 +199,11 @@ class _PlacedRows:
         return [*self._key(result.episode), result.outcome, result.reason, result.steps, repr(float(result.margin))]
 
 
+def _is_result(outcome: str, reason: str, steps: str, margin: str) -> bool:
+    """True if these can be of an episode; raises ValueError where they are no numbers."""
+    return outcome in OUTCOMES and int(steps) >= 0 and (outcome == "error" or not math.isnan(float(margin)))
+
+
 def _check_same(path: Path, wanted: JsonObject, *, other: bool) -> None:
     """Refuse a folder whose episodes are of another run, or of another study; of the `other` file the run counts alone.
 
@@ -202,9 +212,12 @@ def _check_same(path: Path, wanted: JsonObject, *, other: bool) -> None:
     if not path.exists():
         return
     stored = read_object(path, 1 << 20)
-    found = differing_key(stored.get("run") or {}, wanted["run"], ("repeats",) if other else ())
+    run, study = stored.get("run"), stored.get("study")
+    if not isinstance(run, dict) or not isinstance(study, dict):
+        raise InputError(f"{path}: is not what a study of placements wrote; name another folder")
+    found = differing_key(run, wanted["run"], ("repeats",) if other else ())
     if found is None and not other:
-        found = differing_key(stored.get("study") or {}, wanted["study"])
+        found = differing_key(study, wanted["study"])
     if found is not None:
         key, was, now = found
         raise InputError(

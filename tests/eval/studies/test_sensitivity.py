@@ -137,9 +137,15 @@ def test_an_interrupted_grid_goes_on(tmp_path, monkeypatch, capsys):
     for other, words in ((("--grid", "2"), "grid was"), (("--seed", "1"), "seeds was 0, now 1")):
         assert call(tmp_path / "out", *flags, *other) == 2
         assert f"holds episodes of another study: {words}" in capsys.readouterr().err and not HalfEnv.played
-    path.write_text("point\n")
+    whole = path.read_text()
+    damaged = ("point\n", "", whole.replace("timeout", "banana"), whole.replace(",4,", ",x,"), whole + "\udcff")
+    for text in damaged:
+        path.write_text(text, errors="surrogateescape")
+        assert call(tmp_path / "out", *flags) == 2, text
+        assert "episodes.csv: is not what a study of placements wrote" in capsys.readouterr().err
+    path.with_suffix(".json").write_text('{"run": [1], "study": {}}')
     assert call(tmp_path / "out", *flags) == 2
-    assert "episodes.csv: is not what a study of placements wrote" in capsys.readouterr().err
+    assert "episodes.json: is not what a study of placements wrote" in capsys.readouterr().err
 
 
 def test_one_axis_is_a_map_of_one_row(tmp_path):
