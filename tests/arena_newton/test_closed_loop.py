@@ -237,7 +237,7 @@ def test_reach_tells_a_slope_that_holds_from_one_that_does_not():
 
 
 def test_a_slope_next_to_a_fall_does_not_hold():
-    """Where a world falls within a scale, to one side or to both, differences are not finite, and nothing holds."""
+    """Nothing holds within a scale in which a world falls, to one side or to both: differences are not finite."""
 
     def falls(points):
         return points.masked_fill(points > 0.5, -torch.inf)[:, 0]
