@@ -54,8 +54,8 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 if (_CHECKOUT / "pyproject.toml").is_file() and (_CHECKOUT / "kernels").is_dir():
     sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != _CHECKOUT]
 
-_IMPORTED = "".join(sys.orig_argv[sys.orig_argv.index("-m") + 1 :][:1]) if "-m" in sys.orig_argv[:-1] else ""
-_IMPORTED *= sys.argv[:1] == ["-m"]
+_RUNS_MODULE = sys.argv[:1] == ["-m"] and "-m" in sys.orig_argv[:-1]
+_IMPORTED = sys.orig_argv[sys.orig_argv.index("-m") + 1] if _RUNS_MODULE else ""
 """Module that `python -m` is about to run."""
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
-from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
+from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, FIRST_SHAPE
 from arena_newton.tasks.base import KEY_OBJECT
 
 __all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "goal_colour", "hue_lacks", "luminance", "palette"]
@@ -73,8 +73,8 @@ FACINGS = (0.45, 0.6, 0.725, 0.85, 1.0)
 """Light of the dome on surfaces that face down to up (`BOUNCE` to 1)."""
 LUMA = (77.0, 150.0, 29.0)
 """Weights of red, green and blue in luminance, of 256 (Rec. 601)."""
-SHAPES, FIRST_SHAPE = 256, 2
-"""Values of a byte that names a shape, and the first of them that is neither background nor robot."""
+SHAPES = 256
+"""Values of a byte that names a shape."""
 LEAST_CHROMA = 0.08
 """Distance of a goal's colour from grey, in RGB from 0 to 1, from which its hue tells it apart."""
 LIKE_HUE, LIKE_CHROMA = 0.8, 1 / 3

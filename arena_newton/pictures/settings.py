@@ -27,12 +27,15 @@ __all__ = [
     "recorded_camera",
     "robot_fit",
     "video_sizes",
+    "FIRST_SHAPE",
 ]
 
 DOME_INTENSITY = 3000.0
 """Intensity of the original's dome light."""
 DOME_COLOR = (0.75, 0.75, 0.75)
 """Colour of the original's dome light, linear RGB."""
+FIRST_SHAPE = 2
+"""First byte of a frame of looks that names a shape; 0 is the background, 1 the robot."""
 Fit = Literal["native", "pad"]
 FRONT = "front"
 """Name of the head camera in datasets, and of its picture among those that a policy observes."""
