@@ -2,7 +2,7 @@
 
 A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
 work can be captured in a CUDA graph (`torch.where` with a number cannot: it would copy that to the device). Texture and
-shading of a shape stay: each pixel's luminance over the mean of its shape times the new colour. The robot and shapes
+shading of a shape stay, or lose a part: each pixel's luminance over the mean of its shape times the new colour. The robot and shapes
 whose colour matters keep theirs, nothing is put before them, and for nothing else a colour like it is chosen: a policy
 that is sent to the green target would learn not to trust green. Highlights and casts may still come near it.
 
@@ -100,6 +100,8 @@ class Changes:
     """New colours of shapes that a hand must find (`TaskSpec.recolour` is `KEY_OBJECT`)."""
     goals: float = 0.0
     """New colours of what the task is about, where its form tells it apart (`TaskSpec.recolour` is `GOAL_OBJECT`)."""
+    flat: float = 0.0
+    """A part of its texture and shading less, of each shape that gets another colour."""
 
     def chances(self, own: torch.Tensor) -> torch.Tensor:
         """Probability of another colour of shapes whose films say `own`."""
@@ -257,7 +259,11 @@ def recoloured(
     three = _colours(3 * SHAPES, colours).view(batch, SHAPES, 9).take_along_dim(part[..., None], 1)
     chosen = three.view(batch, -1, 3).take_along_dim((3 * shapes + which)[..., None], 1)
     light, count = torch.zeros_like(sums).scatter_add_(2, part.expand_as(sums), sums).gather(2, part.expand_as(sums))
-    shade = _over(luma, (light / count.clamp_min(1)).gather(1, shapes))[..., None]
+    shade = _over(luma, (light / count.clamp_min(1)).gather(1, shapes))
+    if changes.flat:
+        less = (torch.rand((batch, SHAPES), device=device) / changes.flat).clamp_max_(1.0)
+        shade = shade.pow_(less.gather(1, part).gather(1, shapes))
+    shade = shade[..., None]
     return torch.where(mine.gather(1, shapes)[..., None], chosen.mul_(shade).clamp_(0.0, 1.0), pixels)
 
 

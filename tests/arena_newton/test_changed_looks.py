@@ -155,6 +155,21 @@ def test_key_objects_and_goals_change_as_often_as_is_asked(batch, kind, shape, o
         assert found == 0.0 if asked == 0.0 else abs(found - walls) < 0.2, (found, walls)
 
 
+def test_flat_shapes_lose_texture(batch):
+    """Of shapes that get one other colour about half keep less of their texture, and some of those nearly none."""
+    seen, frames, chances, *others = batch
+    walls = frames[..., 0] == WALL
+    spread = {}
+    for flat in (0.0, 0.5):
+        torch.manual_seed(2)
+        plain = Changes(colours=1.0, patterns=0.0, flat=flat, light=0.0, things=0.0, rectangles=0.0, exposure=0.0)
+        values = changed_looks(*batch, plain).amax(dim=-1).double()
+        spread[flat] = torch.stack([one[wall].std() / one[wall].mean() for one, wall in zip(values, walls, strict=True)])
+    less = spread[0.5] < 0.9 * spread[0.0]
+    assert 0.2 < less.double().mean() < 0.6 and (spread[0.5] < 0.3 * spread[0.0]).any()
+    assert (spread[0.5] <= spread[0.0] + 1e-9).all()
+
+
 def test_nothing_gets_the_colour_of_a_goal_that_is_told_by_it(batch):
     """Beside a green goal no shape, thing or rectangle is drawn in a green; beside a grey one all colours may be."""
     seen, frames, chances, *rest = batch
