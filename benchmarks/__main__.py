@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from arena_newton.cli.command_line import exit_code
 from arena_newton.cli.extras import require
-from arena_newton.cli.flags import parse_flags
+from arena_newton.cli.flags import check_bounds, parse_flags
 from arena_newton.errors import InputError
 from benchmarks.bench_options import (
     AuditTimeOptions,
@@ -106,6 +106,7 @@ def _run(arguments: list[str]) -> int:
         raise InputError(f"{name}: unknown bench, known are {' '.join(BENCHES)}")
     bench = BENCHES[name]
     options = parse_flags(bench.options, arguments, f"{PROG} {name}")
+    check_bounds(options)
     for extra in bench.extras:
         require(extra, f"benchmarks {name}")
     from arena_newton.cli.quiet import quiet_warp

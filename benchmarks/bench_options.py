@@ -259,7 +259,7 @@ class GradientBenchOptions(PlainBenchOptions):
     """Episodes of each task that are replayed."""
     step: float = 1e-6
     """Step of the differences of a tick or a closed loop."""
-    limit: float = 300.0
+    limit: float = field(default=300.0, metadata=bounds(1.0, 86_400.0))
     """Time after which featherstone is left, by the clock [s]: nearly all of it is compilation, which goes on beside
     what comes after it."""
 

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 
 import torch
 
-from arena_newton.cli.flags import check_bounds
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.own_processes import environment
@@ -35,7 +34,6 @@ def check(options: TrainingBenchOptions) -> None:
     Raises:
         InputError: A flag's value is unfit.
     """
-    check_bounds(options)
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if not options.trainings or not all(1 <= n <= MOST_TRAININGS for n in options.trainings):
         raise InputError(f"--trainings: expected numbers from 1 to {MOST_TRAININGS}")

@@ -2,9 +2,10 @@
 
 A batch is changed on its device, with tensors of fixed shapes and the device's default generator alone, so that the
 work can be captured in a CUDA graph (`torch.where` with a number cannot: it would copy that to the device). Texture and
-shading of a shape stay, or lose a part: each pixel's luminance over the mean of its shape times the new colour. The robot and shapes
-whose colour matters keep theirs, nothing is put before them, and for nothing else a colour like it is chosen: a policy
-that is sent to the green target would learn not to trust green. Highlights and casts may still come near it.
+shading of a shape stay, or lose a part: each pixel's luminance over the mean of its shape times the new colour. The
+robot and shapes whose colour matters keep theirs, nothing is put before them, and for nothing else a colour like it is
+chosen: a policy that is sent to the green target would learn not to trust green. Highlights and casts may still come
+near it.
 
 What semantic mode shows is not among the looks: every drawn colour is one of `palette`, which keeps its distance from
 `SEMANTIC_COLOURS`; so a brick is never drawn in the colour of that mode's bricks. Lights are those of the recording.

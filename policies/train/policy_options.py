@@ -190,7 +190,7 @@ def look_changes(given: Sequence[str]) -> dict[str, float]:
     Raises:
         InputError: One is no name and probability.
     """
-    expected = "a kind of change and a probability, as light=0"
+    expected = "a kind of change and a probability from 0 to 1, as light=0"
     return _task_numbers("--look-changes", given, expected, lambda kind, number: bool(kind) and 0.0 <= number <= 1.0)
 
 

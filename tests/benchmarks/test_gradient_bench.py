@@ -7,6 +7,7 @@ import torch
 
 from arena_newton.robot.canonical import STAND_ACTION
 from benchmarks import featherstone_bench, flight_bench, gradient_bench
+from benchmarks.__main__ import main
 from benchmarks.bench_options import GradientBenchOptions
 
 
@@ -102,3 +103,10 @@ def test_a_solver_that_does_not_end_is_left(monkeypatch, capsys):
     monkeypatch.setattr(featherstone_bench, "_figures", lambda: iter([1 / 0 for _ in "x"]))
     with pytest.raises(ZeroDivisionError):
         list(featherstone_bench.featherstone_figures(5.0))
+
+
+@pytest.mark.parametrize(("flag", "least"), [("limit", 1), ("states", 2)])
+def test_numbers_outside_their_bounds_are_refused(flag, least, capsys):
+    """A limit of less than a second and a single state are refused before anything is measured."""
+    assert main(["gradients", f"--{flag}", "-1"]) == 2
+    assert f": expected a number from {least}" in capsys.readouterr().err
