@@ -484,10 +484,11 @@ def test_text_of_an_entry_stays_text(entry, capsys):
 
 
 def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
-    """The entries in leaderboard/ pass schema, audit and the replay of a short episode, and the board names each."""
+    """The entries in leaderboard/ pass schema and audit, the experts' a replay too, and the board names each."""
     monkeypatch.chdir(ROOT)
-    flags = ["--replay", "1", "--draw", "10", "--out", str(tmp_path / "site")]
-    assert main(["leaderboard", "build", *flags]) == 0, capsys.readouterr().out
+    replayed = ["leaderboard/expert", "--replay", "1", "--draw", "10", "--out", str(tmp_path / "experts")]
+    assert main(["leaderboard", "build", *replayed]) == 0, capsys.readouterr().out
+    assert main(["leaderboard", "build", "--out", str(tmp_path / "site")]) == 0, capsys.readouterr().out
     text = (tmp_path / "site" / "index.html").read_text()
     entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
     assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)
