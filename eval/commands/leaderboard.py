@@ -62,7 +62,7 @@ def run(folders: Sequence[Path], options: LeaderboardOptions, factories: Factori
     for entry in entries:
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", entry.name):
             raise InputError(f"leaderboard: {entry}: a page is named by its entry's folder: letters, digits and _ . -")
-    if len({entry.name for entry in entries} | {"index"}) <= len(entries):
+    if len({entry.name.lower() for entry in entries} | {"index"}) <= len(entries):  # of some disks a page of both
         raise InputError(f"leaderboard: two entries of one name, or one named index: {' '.join(map(str, entries))}")
     if options.replay and options.draw is None:
         raise InputError("--replay: draws episodes by a number that nobody could know; give one by --draw")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +17,7 @@ from arena_newton.eval.leaderboard.entry_file import (
     SIMULATOR,
     UNTRAINED,
     BoardEntry,
+    as_read,
     read_entry,
 )
 from arena_newton.eval.leaderboard.evidence import AuditStatement, earned_level, read_statements
@@ -150,13 +150,11 @@ def played_elsewhere(entry: CheckedEntry, others: Sequence[CheckedEntry]) -> Ite
 
 def named_alike(entry: CheckedEntry, others: Sequence[CheckedEntry]) -> Iterator[str]:
     """Entries among others whose name a reader would take for that of one."""
-
-    def read(one: CheckedEntry) -> str:
-        return " ".join(unicodedata.normalize("NFKC", one.entry.name).casefold().split())
-
+    mine = entry.entry.name
     for other in others:
-        if read(other) == read(entry):
-            yield f"{entry.name}/{ENTRY_FILE}: name is {shown(entry.entry.name)}, as that of entry {other.name}"
+        if as_read(other.entry.name) == as_read(mine):
+            both = f"name is {shown(mine)}, which reads as {shown(other.entry.name)}"
+            yield f"{entry.name}/{ENTRY_FILE}: {both} of {other.name}/{ENTRY_FILE}"
 
 
 def _evidence(entry: CheckedEntry) -> set[str]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
-from unicodedata import category
+from unicodedata import category, normalize
 
 from arena_newton.errors import InputError
 from arena_newton.eval.audit.folder_audit import CONSISTENT, LEVELS, SELF_REPORTED
@@ -18,7 +18,7 @@ from arena_newton.eval.records.schema import MAX_CONFIG_BYTES
 from arena_newton.files.stored_json import MAX_TEXT, Fit, Json, Known, Name, is_name, loaded, read_regular
 from arena_newton.files.text import is_printable, plain, plain_text
 
-__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "SIMULATOR", "UNTRAINED", "BoardEntry", "entry_text", "read_entry"]
+__all__ = ["BUNDLE_FILE", "ENTRY_FILE", "SIMULATOR", "UNTRAINED", "BoardEntry", "as_read", "entry_text", "read_entry"]
 
 ENTRY_FILE = "entry.toml"
 BUNDLE_FILE = "bundle.zip"
@@ -28,6 +28,18 @@ SIMULATOR = "arena_newton"
 UNTRAINED = "none"
 """Training data of a policy that was not trained."""
 
+
+def as_read(name: str) -> str:
+    """Name as readers tell it from others: without case, widths, accents and further spaces (NFKD)."""
+    letters = (c for c in normalize("NFKD", name.casefold()) if category(c) != "Mn")
+    return " ".join("".join(letters).casefold().split())
+
+
+def _told_apart(value: Json) -> bool:
+    """True if a value is a name without letters of other alphabets but π, of π0.5, which looks like none of Latin."""
+    return isinstance(value, str) and is_name(value) and bool(re.fullmatch(r"[ -~π]+", as_read(value)))
+
+
 _DATE = re.compile(r"\d{4}-(?:0[1-9]|1[0-2])(?:-(?:0[1-9]|[12]\d|3[01]))?")
 Date = Annotated[str, Fit("a day or month, as 2026-11-26", lambda v: bool(_DATE.fullmatch(v)))]
 Hash = Annotated[str, Fit("64 hex digits, or nothing", lambda v: bool(re.fullmatch("(?:[0-9a-f]{64})?", v)))]
@@ -36,6 +48,8 @@ Visible = Annotated[
     str, Fit("a name that can be read", lambda v: is_name(v) and v == plain(v) and "Cf" not in map(category, v))
 ]
 """Name without characters that no one sees: with one it would look like another's."""
+Distinct = Annotated[str, Fit("a name of Latin letters (and π), digits and ASCII punctuation", _told_apart)]
+"""Name by which entries are told apart: letters of other alphabets would make it look like another's."""
 Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v))]
 
 
@@ -43,18 +57,18 @@ Text = Annotated[str, Fit("text", lambda v: len(v) < MAX_TEXT and is_printable(v
 class BoardEntry:
     """Statements of an entry about itself, a key of `entry.toml` each."""
 
-    name: Visible
+    name: Distinct
     """Policy as the board names it."""
     authors: Visible
     date: Date
     source: Name
     """Address of code or publication, or the command that plays it."""
-    simulator: Name
+    simulator: Distinct
     training_data: Literal["none", "scripted", "teleoperated", "other"]
     """Demonstrations by whom; `none`: nothing was trained."""
     training: Name
     """Data and training in a sentence."""
-    trackers: tuple[Name, ...]
+    trackers: Annotated[tuple[Distinct, ...], Fit("names of Latin letters, digits and ASCII punctuation")]
     """Trackers that executed the policy."""
     hardware: Name
     """Machine of the evaluation."""

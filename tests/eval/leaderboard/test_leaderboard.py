@@ -159,8 +159,15 @@ def test_a_page_shows_conditions_failures_and_strips(tmp_path, capsys):
     ("keys", "named"),
     [
         ({"name": ""}, 'name is "", expected a name'),
-        ({"name": "Ours\u200b"}, "expected a name that can be read"),
-        ({"name": "Ours\u00ad"}, "expected a name that can be read"),
+        ({"name": "Ours\u200b"}, "expected a name of Latin letters"),
+        ({"name": "\u202eOurs"}, "expected a name of Latin letters"),
+        ({"name": "\u041eurs"}, 'name is "\\u041eurs", expected a name of Latin letters'),  # Cyrillic
+        ({"name": "\u039furs"}, "expected a name of Latin letters"),  # Greek
+        ({"name": "Our\u0455 \u2014 2"}, "expected a name of Latin letters"),
+        ({"name": "\u0300"}, "expected a name of Latin letters"),  # a mark on nothing
+        ({"trackers": ["tw\u0456st2", "sonic"]}, 'trackers is ["tw\\u0456st2", "sonic"], expected names of Latin'),
+        ({"simulator": "\u0430rena_newton"}, "expected a name of Latin letters"),
+        ({"authors": "We\u00ad"}, "expected a name that can be read"),
         ({"date": "yesterday"}, "date is"),
         ({"date": "2026-13-01"}, "date is"),
         ({"training_data": "secret"}, "training_data is"),
@@ -276,9 +283,21 @@ def test_an_entry_is_of_one_policy_and_of_one_owner(made, entry, capsys):
     assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
     said = capsys.readouterr().out
     assert "theirs/bundle.zip: 8 of its runs and episodes are those of entry ours" in said, said
-    fill(theirs, name="\uff2furs")  # of full width
-    assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
-    assert ", as that of entry ours" in capsys.readouterr().out
+    for name in ("\uff2furs", "OURS", "\u00d6urs", " ou\u0301rs\u00a0"):  # of full width, of other case, with accents
+        fill(theirs, name=name)
+        assert main(["leaderboard", "build", str(entry), str(theirs), "--out", str(site)]) == 1
+        named = f'theirs/entry.toml: name is {json.dumps(name)}, which reads as "Ours" of ours/entry.toml'
+        assert named in capsys.readouterr().out
+    shutil.copytree(theirs, entry.parent / "OURS")
+    assert main(["leaderboard", "build", str(entry), str(entry.parent / "OURS")]) == 2
+    assert "two entries of one name" in capsys.readouterr().err
+
+
+def test_a_name_may_have_accents_and_pi(entry, capsys):
+    """Accents, π and text of any alphabet where nothing is told apart by it are taken as they are."""
+    fill(entry, name="π0.5, façade (ours)", authors="王涛文, Łukasz Ж.", training="Дома", training_data="none")
+    code, said, _ = build(entry, capsys)
+    assert code == 0, said
 
 
 def renamed(members):
