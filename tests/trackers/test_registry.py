@@ -1,6 +1,9 @@
 """Trackers are found by name and bad input is answered with one clear line."""
 
+import importlib
+import re
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,3 +143,14 @@ def test_built_in_names_are_taken(monkeypatch):
     assert trackers.get("pd").name == "pd"
     with pytest.raises(InputError, match="'sonic': is built in"):
         trackers.register("sonic", lambda checkpoint: trackers.get("pd"))
+
+
+def test_the_page_about_trackers():
+    """Every Python block of docs/howto/bring/trackers.md runs, one after the other, and gives what the page says."""
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "bring" / "trackers.md").read_text()
+    world: dict = {"__name__": "docs_trackers"}
+    for block in re.findall(r"^```python\n(.*?)^```$", page, flags=re.DOTALL | re.MULTILINE):
+        exec(compile(block, "docs/howto/bring/trackers.md", "exec"), world)
+    assert world["targets"].shape == (20, 29)
+    for name in re.findall(r"`(arena_newton\.trackers\.[\w.]+)`", page):
+        importlib.import_module(name)
