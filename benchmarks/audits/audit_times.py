@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from arena_newton.eval.audit.action_replay import replay
-from arena_newton.eval.audit.draws import drawn, odds
+from arena_newton.eval.audit.draws import drawn, found_by
 from arena_newton.eval.audit.folder_audit import audited
 from arena_newton.eval.bench.timing import BenchFigure, cores
 from benchmarks.bench_options import AuditTimeOptions
@@ -29,7 +29,7 @@ def audit_times(options: AuditTimeOptions) -> Iterator[BenchFigure]:
     yield BenchFigure(
         "lines, links, actions and tables of 1,000 episodes", LINES, "s", True, 1000 * seconds / count, note
     )
-    chosen = drawn(audit, options.replay, 0)
+    (chosen,) = drawn([audit], options.replay, 0)
     if chosen:
         with cores(2):
             clock, began = time.perf_counter(), time.process_time()
@@ -38,5 +38,4 @@ def audit_times(options: AuditTimeOptions) -> Iterator[BenchFigure]:
         note = f"{len(chosen)} took {elapsed:.0f} s, {used:.0f} s of processor time; {len(audit.faults)} contradictions"
         yield BenchFigure("60 episodes played again on two cores", REPLAY, "s", True, 60 * elapsed / len(chosen), note)
     for number in (5, 10, 29, 59):
-        sure = f"find a forged line with {odds(number)}"
-        yield BenchFigure(f"{number} episodes played again", None, "", False, None, sure)
+        yield BenchFigure(f"{number} episodes played again", None, "", False, None, f"find {found_by(number, count)}")

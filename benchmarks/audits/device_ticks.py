@@ -54,7 +54,7 @@ def _ticks(task: str, out: Path, options: DeviceOptions) -> Iterator[BenchFigure
     with contextlib.redirect_stdout(io.StringIO()):
         evaluate(flags)
         audit = audited(out)
-        replay(audit, drawn(audit, None, 0))
+        replay(audit, drawn([audit], None, 0)[0])
     allowed = AuditOptions.tick_tolerance, AuditOptions.velocity_tolerance
     bars = *allowed, DRIFT * allowed[0], DRIFT * allowed[1]
     ticks = sum(record.steps for record in audit.run.records)

@@ -456,10 +456,10 @@ def level_of(
     if found.faults:
         return "lines", found.faults
     for level, asked in (("replay", None), ("policy", policy))[: 1 if policy is None else 2]:
-        replay(found, drawn(found, None, 0), factories, policy=asked)
+        replay(found, drawn([found], None, 0)[0], factories, policy=asked)
         if found.faults or found.absent:
             return level, found.faults or found.notes
-    known = audited(folder, published).faults
+    known = [f"head is {found.head}, published was {published}"] * (found.head != published)
     return "head" if known else "", known
 
 

@@ -244,7 +244,7 @@ def accusations(count: int, replayed: int, seed: int = 0) -> Iterator[tuple[str,
                 with contextlib.redirect_stdout(io.StringIO()):
                     found = audited(run)
                     if number % replayed == 0:
-                        replay(found, drawn(found, 2, number, found.lacking), parts)
+                        replay(found, drawn([found], 2, number, at_hand=True)[0], parts)
                 yield name, [f"{fault} ({' '.join(flags)})" for fault in found.faults], found.replayed or 0
     finally:
         worlds.drop()

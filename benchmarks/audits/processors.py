@@ -77,7 +77,7 @@ def _replayed_here(folder: str, policy: str) -> str:
     for _ in range(2):
         audit = audited(Path(folder).expanduser())
         began = time.process_time()
-        replay(audit, drawn(audit, None, 0), policy=policy or None, tolerance=1.0)
+        replay(audit, drawn([audit], None, 0)[0], policy=policy or None, tolerance=1.0)
         seconds = time.process_time() - began
     return json.dumps({"contradictions": audit.faults, "answer": audit.largest.get("answer"), "seconds": seconds})
 

@@ -21,7 +21,6 @@ from arena_newton.eval.audit.claimed_conditions import (
     hold_signals,
     note_difference,
 )
-from arena_newton.eval.audit.draws import odds
 from arena_newton.eval.audit.folder_audit import CONSISTENT, ENGINE, Audit
 from arena_newton.eval.audit.tick_check import EPISODE, SECOND, START, STILL, StatesAgain, TickDifferences
 from arena_newton.eval.folders.run_folder import CAMERAS, actions_folder, stored_options
@@ -118,20 +117,17 @@ def replay(
         tolerances = tick_tolerance, velocity_tolerance
         _play(audit, stored, records, made, policy, tolerance, totals, by_tick=by_tick, tolerances=tolerances)
     audit.replayed, audit.played = len(records), [record.index for record in records]
-    audit.policy, audit.tolerance = policy, tolerance
+    audit.policy, audit.tolerance, audit.asked = policy, tolerance, None if policy is None else len(records)
     audit.largest |= {"answer": totals.largest} if policy is not None else {}
     audit.largest |= dict(zip(MEASURED, totals.furthest, strict=True)) if by_tick else {}
-    sure = "any forged line" if len(records) == len(run.records) else f"a forged line with {odds(len(records))}"
-    audit.notes.append(f"{counted(len(records), 'episode')} played again: that finds {sure}.")
-    if by_tick:
+    if by_tick and records:
         audit.notes.append(
             f"Played on another engine: each tick was checked on {ENGINE} from the recorded state before it, no bit "
             f"counts. At most off are bodies {totals.furthest[0]:.2g} m (--tick-tolerance {tick_tolerance:g}) and "
             f"velocities {totals.furthest[1]:.2g} m/s or rad/s (--velocity-tolerance {velocity_tolerance:g}); over a "
             f"second they add up to {totals.furthest[2]:.2g} and {totals.furthest[3]:.2g}, allowed are {DRIFT:g} times."
         )
-    if policy is not None:
-        audit.asked = len(records)
+    if policy is not None and records:
         audit.notes.append(
             f"The policy was asked again: {totals.equal} of {counted(totals.compared, 'action')} are equal to the bit, "
             f"the largest difference is {totals.largest:.3g} (--tolerance {tolerance:g})."

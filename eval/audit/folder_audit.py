@@ -1,4 +1,4 @@
-"""Audit of one results folder: chain, lines, derived files, and the level to which it was checked."""
+"""Audit of results folders: chain, lines, derived files, and the level to which they were checked together."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from arena_newton.errors import InputError
+from arena_newton.eval.audit.draws import found_by
 from arena_newton.eval.audit.line_checks import action_faults, configuration_faults, is_current, line_faults
 from arena_newton.eval.folders.original_format import ORIGINAL
 from arena_newton.eval.folders.results import OWN_FOLDER, Results, RunRecord, in_plan_order, results_json
-from arena_newton.eval.records.chain import broken_links
+from arena_newton.eval.records.chain import broken_links, joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, plan_faults, read_document, step_budgets
 from arena_newton.eval.records.journal import JOURNAL_FILE, EpisodeRecord, read_journal, write_atomic
 from arena_newton.eval.reports import report
@@ -23,7 +24,8 @@ from arena_newton.files.stored_json import JsonObject, parse, read_regular
 from arena_newton.files.text import counted, plain_text
 from arena_newton.pages.tables import Table, escaped
 
-__all__ = ["AUDIT_FILE", "ENGINE", "LEVELS", "Audit", "audited", "print_findings", "runs_in", "write_pages"]
+__all__ = ["AUDIT_FILE", "ENGINE", "LEVELS", "Audit", "audited", "facts_of", "print_findings", "runs_in", "sureness"]
+__all__ += ["write_pages"]
 
 RESULTS_FILE, TABLE_FILE = "results.json", "table.csv"
 WRITER = "written_by"
@@ -39,6 +41,8 @@ AUDIT_FILE = "audit.json"
 """An audit's findings, by folder."""
 ENGINE = "mujoco"
 """The engine whose episodes can be played again to the last bit."""
+UNCHAINED = "unchained"
+"""Head of a run of which a line is of a version without chain."""
 SELF_REPORTED, CONSISTENT, REPLAYED, RERUN = "self-reported", "consistent", "replayed", "re-run"
 LEVELS = {
     SELF_REPORTED: "numbers of the owner; nothing was checked, or something contradicts",
@@ -92,30 +96,13 @@ class Audit:
     after a tick of another engine, and of both the sum over a second."""
 
     @property
-    def level(self) -> str:
-        """Highest level without a contradiction."""
-        if self.faults:
-            return SELF_REPORTED
-        if not self.replayed or self.absent:
-            return CONSISTENT
-        return RERUN if self.asked else REPLAYED
-
-    @property
     def head(self) -> str:
         """Head of the chain, or `unchained`."""
-        return self.results.get("head", "unchained")
-
-    def facts(self) -> list[tuple[str, str]]:
-        """Facts of the audit by name."""
-        episodes = f"{self.results['finished']} of {self.results['planned']}"
-        replayed = "none" if self.replayed is None else f"{self.replayed} of {self.results['finished']}"
-        played = [(name, str(n)) for name, n in (("asked again", self.asked), ("fresh", self.fresh)) if n is not None]
-        found = [("level", self.level), ("head", self.head), ("episodes", episodes), ("replayed", replayed), *played]
-        return [*found, ("contradictions", str(len(self.faults))), ("configuration", self.results["config_hash"])]
+        return self.results.get("head", UNCHAINED)
 
     def to_json(self) -> JsonObject:
         """Content of audit.json."""
-        return dict(self.facts()) | {
+        return dict(facts_of([self])) | {
             "levels": LEVELS,
             "contradictions": self.faults,
             "notes": self.notes,
@@ -130,12 +117,44 @@ class Audit:
         }
 
 
-def audited(folder: Path, published: str | None = None) -> Audit:
+def level_of(audits: Sequence[Audit]) -> str:
+    """Highest level without a contradiction, of runs whose episodes were drawn together."""
+    if any(one.faults for one in audits):
+        return SELF_REPORTED
+    if not any(one.replayed for one in audits) or any(one.absent for one in audits):
+        return CONSISTENT
+    return RERUN if any(one.asked for one in audits) else REPLAYED
+
+
+def facts_of(audits: Sequence[Audit]) -> list[tuple[str, str]]:
+    """Facts of the audit of one or several runs, by name."""
+
+    def total(name: str) -> int | None:
+        known = [number for one in audits if (number := getattr(one, name)) is not None]
+        return sum(known) if known else None
+
+    head, again = joint_head([one.results.get("head") for one in audits]) or UNCHAINED, total("replayed")
+    finished, planned = sum(one.results["finished"] for one in audits), sum(one.results["planned"] for one in audits)
+    found = [("level", level_of(audits)), ("head", head), ("episodes", f"{finished} of {planned}")]
+    found += [("replayed", "none" if again is None else f"{again} of {finished}")]
+    played = [("asked again", total("asked")), ("fresh", total("fresh"))]
+    found += [(name, str(number)) for name, number in played if number is not None]
+    found += [("contradictions", str(sum(len(one.faults) for one in audits)))]
+    return found + [("configuration", one.results["config_hash"]) for one in audits if len(audits) == 1]
+
+
+def sureness(audits: Sequence[Audit]) -> list[str]:
+    """Sentence about how probably the episodes that were played again show a forged line; none where none were."""
+    again = sum(one.replayed or 0 for one in audits)
+    sure = found_by(again, sum(one.results["finished"] for one in audits))
+    return [f"{counted(again, 'episode')} played again: that finds {sure}."] * bool(again)
+
+
+def audited(folder: Path) -> Audit:
     """Check a results folder without the simulator.
 
     Args:
         folder: The folder; nothing in it is written.
-        published: Head that was published with its numbers, if one was.
 
     Raises:
         InputError: It holds no run, or journal or configuration cannot be read as one.
@@ -149,7 +168,7 @@ def audited(folder: Path, published: str | None = None) -> Audit:
     planned = [record for record in records if record.task in known and record.group_seed in seeds]
     run = RunRecord(folder, document, in_plan_order(planned))
     found = Audit(run, results_json(run))
-    for fault in _faults(run, records, found, published):
+    for fault in _faults(run, records, found):
         found.faults.append(plain_text(fault, 2000))
         if len(found.faults) == MOST_FAULTS:
             found.notes.append(f"The audit stopped after {counted(MOST_FAULTS, 'contradiction')}.")
@@ -178,14 +197,12 @@ def _ended(records: Sequence[EpisodeRecord]) -> set[int]:
     return {one.index for one in records if one.outcome != "error"}
 
 
-def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit, published: str | None) -> Iterator[str]:
+def _faults(run: RunRecord, records: list[EpisodeRecord], found: Audit) -> Iterator[str]:
     """All contradictions, in the order of a reader: configuration, lines, chain, actions, tables."""
     yield from configuration_faults(run)
     yield from map(str, plan_faults(run.folder, records, run.document))
     yield from line_faults(run, records)
     yield from broken_links(run.folder / JOURNAL_FILE, records)
-    if published is not None and found.head != published:
-        yield f"{run.folder / JOURNAL_FILE}: head is {found.head}, published was {published}"
     yield from action_faults(run, run.records, found.lacking)
     yield from _derived_faults(run, found)
 
@@ -292,12 +309,15 @@ def write_pages(audits: list[Audit], out: Path) -> None:
     """
     content = {str(one.run.folder): one.to_json() for one in audits}
     write_atomic(out / AUDIT_FILE, json.dumps(content, indent=2) + "\n")
+    together = [(counted(len(audits), "run"), audits)] if len(audits) > 1 else []
     lines = ["# Audit", ""]
-    for one in audits:
-        lines += [f"## {escaped(str(one.run.folder))}: {one.level}", ""]
-        lines += [*Table(("", ""), one.facts(), "ll").compact(escaped, ("---", "---")), ""]
-        lines += [f"- contradiction: {escaped(fault)}" for fault in one.faults]
-        lines += [f"- {escaped(note)}" for note in one.notes] + [""]
+    for title, some in [*together, *((str(one.run.folder), [one]) for one in audits)]:
+        lines += [f"## {escaped(title)}: {level_of(some)}", ""]
+        lines += [*Table(("", ""), facts_of(some), "ll").compact(escaped, ("---", "---")), ""]
+        if len(some) == 1:
+            lines += [f"- contradiction: {escaped(fault)}" for fault in some[0].faults]
+            lines += [f"- {escaped(note)}" for note in some[0].notes]
+        lines += [f"- {note}" for note in sureness(some) if len(some) == len(audits)] + [""]
     lines += ["## Levels", "", *(f"- {level}: {text}" for level, text in LEVELS.items())]
     write_atomic(out / "audit.md", "\n".join(lines) + "\n")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from arena_newton.errors import InputError
 
 if TYPE_CHECKING:
+    from arena_newton.eval.audit.folder_audit import Audit
     from arena_newton.eval.play.factories import Factories
 
 __all__ = ["AuditOptions", "run"]
@@ -26,9 +27,10 @@ class AuditOptions:
     """
 
     head: str | None = None
-    """Head that was published with the numbers of the one folder; the journal must have it."""
+    """Head that was published with the numbers: the journal of the folder, or those of all folders, must have it."""
     replay: int = 0
-    """Play so many episodes again on engine mujoco, from their actions alone: they must end as recorded, to the bit."""
+    """Play so many episodes again, drawn over all runs together, on engine mujoco, from their actions alone: they must
+    end as recorded, to the bit."""
     draw: int | None = None
     """Number of your own by which, with the head, they are drawn; without one a random one, which is printed."""
     all: bool = False
@@ -60,8 +62,14 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         InputError: A folder holds no run, or cannot be read as one.
     """
     from arena_newton.eval.audit.draws import drawn
-    from arena_newton.eval.audit.folder_audit import audited, print_findings, runs_in, write_pages
-    from arena_newton.eval.records.chain import joint_head
+    from arena_newton.eval.audit.folder_audit import (
+        audited,
+        facts_of,
+        print_findings,
+        runs_in,
+        sureness,
+        write_pages,
+    )
     from arena_newton.files.text import counted
 
     named = [inside for folder in folders for inside in runs_in(folder)]
@@ -80,32 +88,35 @@ def run(folders: Sequence[Path], options: AuditOptions, factories: Factories | N
         raise InputError("--replay and --all: both say which episodes are played again; drop one")
     if options.draw is not None and not (options.replay or options.fresh):
         raise InputError("--draw: draws the episodes of --replay or --fresh; add one of them")
-    if options.head is not None and len(named) > 1:
-        raise InputError("--head: is of one folder")
     draw = secrets.randbelow(1 << 31) if options.draw is None else options.draw
     if options.draw is None and (options.replay or options.fresh):
         print(f"--draw {draw}: drawn at random, for the owner of the results cannot know it", flush=True)
-    audits = []
-    for folder in named:
-        one = audited(folder, options.head)
+
+    def said(some: Sequence[Audit]) -> str:
+        return ", ".join(f"{name} {value}" for name, value in facts_of(some))
+
+    audits = [audited(folder) for folder in named]
+    if options.head not in (None, head := dict(facts_of(audits))["head"]):
+        where = " ".join(map(str, folders))
+        audits[0].faults.append(f"{where}: head is {head}, published was {options.head}")
+    chosen = drawn(audits, None if options.all else options.replay, draw)
+    for folder, one, records in zip(named, audits, chosen, strict=True):
         if options.replay or options.all:
             from arena_newton.eval.audit.action_replay import replay
 
             names = ("policy", "tolerance", "tick_tolerance", "velocity_tolerance")
             asked = {name: getattr(options, name) for name in names}
             one.draw = None if options.all else draw
-            chosen = drawn(one, None if options.all else options.replay, draw)
-            replay(one, chosen, factories, **asked)
+            replay(one, records, factories, **asked)
         if options.fresh and options.policy is not None:
             from arena_newton.eval.audit.fresh_episodes import play_fresh
 
             play_fresh(one, options.policy, options.fresh, draw, factories)
-        audits.append(one)
-        print(f"{folder}: {', '.join(f'{name} {value}' for name, value in one.facts())}")
+        print(f"{folder}: {said([one])}")
         print_findings(one.faults, one.notes)
-    joint = joint_head([one.results.get("head") for one in audits])
-    if len(audits) > 1 and joint is not None:
-        print(f"Head of {counted(len(audits), 'journal')}: {joint}.")
+    if len(audits) > 1:
+        print(f"{counted(len(audits), 'run')}: {said(audits)}")
+    print_findings([], sureness(audits))
     if options.out is not None:
         out = Path(options.out).expanduser()
         write_pages(audits, out)

@@ -26,7 +26,7 @@ class LeaderboardOptions:
     out: str = "site"
     """Folder of the site; its first page is index.html."""
     replay: int = 0
-    """Play so many episodes of each run again, of those whose actions are in its bundle."""
+    """Play so many episodes of each entry again, of those whose actions are in its bundle."""
     draw: int | None = None
     """Number of your own by which, with the head, they are drawn; --replay asks for one."""
 
@@ -100,8 +100,8 @@ class BundleOptions:
     out: str = "leaderboard/mine"
     """Folder of the entry; its name is that of the entry's page."""
     actions: int = 5
-    """Episodes of each run whose actions come along, so that an audit can play them again; 50 kB each. They are drawn
-    by the head of the journal."""
+    """Episodes whose actions come along, so that an audit can play them again; 50 kB each. They are drawn over all runs
+    by their head."""
     strips: int = 2
     """Film strips of each run that come along, where it has some; 0.1 MB each."""
 

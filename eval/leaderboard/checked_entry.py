@@ -9,8 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arena_newton.errors import InputError
-from arena_newton.eval.audit.draws import drawn, odds
-from arena_newton.eval.audit.folder_audit import AUDIT_FILE, CONSISTENT, LEVELS, SELF_REPORTED, Audit, audited, runs_in
+from arena_newton.eval.audit.draws import drawn, found_by
+from arena_newton.eval.audit.folder_audit import (
+    AUDIT_FILE,
+    CONSISTENT,
+    LEVELS,
+    SELF_REPORTED,
+    Audit,
+    audited,
+    runs_in,
+    sureness,
+)
 from arena_newton.eval.leaderboard.entry_file import (
     BUNDLE_FILE,
     ENTRY_FILE,
@@ -74,7 +83,7 @@ def check_entry(
     Args:
         folder: Folder of the entry.
         into: Empty folder for its bundle.
-        replays: Episodes of each run to play again, where their actions are there.
+        replays: Episodes of all its runs together to play again, of those whose actions are there.
         draw: Number by which they are drawn.
         factories: What worlds and trackers are made with; the real ones by default.
 
@@ -185,9 +194,9 @@ def _covered(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> s
     draws = " ".join(sorted({str(one.draw) for one in used if one.draw is not None}))
     text = f"{AUDIT_FILE}: {again} of {counted(finished, 'episode')} played again"
     text += f", by draw {draws}; their actions are in the bundle" if draws else ""
-    sure = "any forged line" if again == finished else f"a forged line with {odds(again)}"
     policies = " ".join(sorted({one.policy for one in used if one.policy is not None}))
-    return f"{text}. That finds {sure}." + f" Policy {policies} was asked again at their queries." * bool(policies)
+    text += f". That finds {found_by(again, finished)}."
+    return text + f" Policy {policies} was asked again at their queries." * bool(policies)
 
 
 def _audit(
@@ -195,19 +204,19 @@ def _audit(
 ) -> Sequence[PlayedCell]:
     """Audit every run of an unpacked bundle; its cells."""
     folders, suite, notes = runs_in(root), (root / SUITE_FILE).exists(), Counter[str]()
-    for folder in folders:
-        audit = audited(folder)
-        if replays:
+    checked.audits += [audited(folder) for folder in folders]
+    for audit, records in zip(checked.audits, drawn(checked.audits, replays, draw, at_hand=True), strict=True):
+        if records:
             from arena_newton.eval.audit.action_replay import replay  # loads the simulator
 
-            replay(audit, drawn(audit, replays, draw, audit.lacking), factories)
-        checked.audits.append(audit)
+            replay(audit, records, factories)
         checked.faults += [fault.replace(f"{root}/", f"{checked.name}/") for fault in audit.faults]
         notes.update(note.replace(f"{root}/", f"{checked.name}/") for note in audit.notes)
         if not (suite or audit.results["complete"]):  # failures may be what is left out; a suite's tables leave it out
             number = f"{audit.results['finished']} of {audit.results['planned']} episodes"
             checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: a run of {number}; rates are of whole plans")
     checked.notes += [f"{note} ({counted(runs, 'run')})" if runs > 1 else note for note, runs in notes.items()]
+    checked.notes += sureness(checked.audits)
     found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
     if not found:
         checked.faults.append(

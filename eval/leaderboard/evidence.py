@@ -20,8 +20,8 @@ from arena_newton.files.text import counted, plain_text
 __all__ = ["LEAST", "AuditStatement", "earned_level", "read_statements"]
 
 LEAST = 20
-"""Episodes of an entry that must have been played again for level `replayed`, or all: they find one forged line of ten
-with 88 %."""
+"""Episodes of all runs of an entry together that must have been played again for level `replayed`, or all: they find
+one forged line of ten with 88 %."""
 MOST_TOLERANCE = 1e-4
 """Largest --tolerance under which answers of a policy are still the recorded ones."""
 
@@ -91,7 +91,7 @@ def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement])
     """First thing that an audit that played the bundle's episodes again would have; empty: nothing is missing."""
     if not stated:
         return f"there is no {AUDIT_FILE}"
-    number = playable = 0
+    used = []
     for audit in audits:
         one = stated.get(audit.head)
         if one is None:
@@ -100,20 +100,26 @@ def _not_replayed(audits: Sequence[Audit], stated: Mapping[str, AuditStatement])
             return f"{AUDIT_FILE}: contradictions: {plain_text(one.contradictions[0], 200)}"
         if (engine := audit.run.config.get("engine")) != ENGINE:
             return f"{BUNDLE_FILE}: engine is {shown(engine)}, {ENGINE} alone repeats bits"
-        wanted = None if one.draw is None else len(one.played)
-        if list(one.played) != [record.index for record in drawn(audit, wanted, one.draw or 0)]:
-            by = "all episodes" if one.draw is None else f"what draw {one.draw} draws by the head"
+        used.append(one)
+    draw, number = used[0].draw, sum(len(one.played) for one in used)
+    wanted = drawn(audits, None if draw is None else number, draw or 0)
+    for audit, one, records in zip(audits, used, wanted, strict=True):
+        if one.draw != draw or list(one.played) != [record.index for record in records]:
+            by = "all episodes" if draw is None else f"what draw {draw} draws by the head of all runs"
             return f"{AUDIT_FILE}: played is not {by}"
         if gone := sorted(set(one.played) & set(audit.lacking)):
             return f"{BUNDLE_FILE}: actions of episode {gone[0]}, which was played again, are not there"
-        number, playable = number + len(one.played), playable + len(drawn(audit, None, 0))
-    if number < (least := min(LEAST, playable)):
+    if number < (least := min(LEAST, sum(map(len, drawn(audits, None, 0))))):
         return f"{AUDIT_FILE}: played is {counted(number, 'episode')}, expected at least {least}"
     return ""
 
 
 def _not_asked(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) -> str:
-    """First thing that an audit that asked the policy again would have; empty: nothing is missing."""
+    """First thing that an audit that asked the policy again would have; empty: nothing is missing.
+
+    A run of which no episode was drawn must name a policy that was asked in another.
+    """
+    known = [named_policy(one.asked_policy or {}) for audit in audits if (one := stated[audit.head]).played]
     for audit in audits:
         one, played = stated[audit.head], str(audit.run.config["policy"])
         if one.policy is None or one.asked != len(one.played):
@@ -121,10 +127,11 @@ def _not_asked(audits: Sequence[Audit], stated: Mapping[str, AuditStatement]) ->
         kind, own = policy_kind(one.policy), policy_kind(played)
         if kind not in (own, *SERVED) and own not in SERVED:
             return f"{AUDIT_FILE}: policy is {shown(one.policy)}, its run has {shown(played)}"
-        asked = named_policy(one.asked_policy or {})
-        if policy_kind(asked["policy"]) != kind:
-            return f"{AUDIT_FILE}: asked_policy: policy is {shown(asked['policy'])}, expected {shown(one.policy)}"
-        for text in misnamed_policy(named_policy(audit.run.config), asked):
+        asked = [named_policy(one.asked_policy or {})] if one.played or not known else known
+        if policy_kind(asked[0]["policy"]) != kind:
+            return f"{AUDIT_FILE}: asked_policy: policy is {shown(asked[0]['policy'])}, expected {shown(one.policy)}"
+        named = named_policy(audit.run.config)
+        for text in min((list(misnamed_policy(named, other)) for other in asked), key=len):
             return f"{CONFIG_FILE}: {text}"
         if not 0 <= one.tolerance <= MOST_TOLERANCE:
             return f"{AUDIT_FILE}: tolerance is {one.tolerance:g}, expected at most {MOST_TOLERANCE:g}"

@@ -46,7 +46,7 @@ def made_bundle(
 
     Args:
         folder: A results folder, a suite, or a folder of several.
-        actions: Episodes of each run whose actions come along; the head of the journal draws them, not the owner.
+        actions: Episodes of all runs together whose actions come along; the head draws them, not the owner.
         strips: Film strips of each run that come along, at most one of a task and outcome, failures first.
         stated: What an audit says of the runs, by head: the actions of the episodes that it played come along instead.
 
@@ -58,15 +58,16 @@ def made_bundle(
     """
     names = [path for pattern in (SUITE_FILE, "suite.*.jsonl") for path in sorted(folder.glob(pattern))]
     audits, columns = [audited(inside) for inside in runs_in(folder)], set[Path]()
-    for audit in audits:
+    chosen = drawn(audits, actions, 0, at_hand=True)
+    if stated.keys() & {audit.head for audit in audits}:
+        played = [{*stated[audit.head].played} - {*audit.lacking} if audit.head in stated else () for audit in audits]
+        chosen = [[one for one in a.run.records if one.index in some] for a, some in zip(audits, played, strict=True)]
+    for audit, records in zip(audits, chosen, strict=True):
         if audit.faults:
             raise InputError(f"{audit.faults[0]}; all contradictions: eval audit {folder}")
         inside = audit.run.folder
         names += [inside / CONFIG_FILE, inside / JOURNAL_FILE]
-        chosen = drawn(audit, actions, 0, audit.lacking) if actions else []
-        if (one := stated.get(audit.head)) is not None and one.played:
-            chosen = [record for record in audit.run.records if record.index in set(one.played) - set(audit.lacking)]
-        paths = {inside / str((record.media or {})["actions"]): record.schema for record in chosen if record.steps}
+        paths = {inside / str((record.media or {})["actions"]): record.schema for record in records if record.steps}
         columns |= {path for path, schema in paths.items() if schema >= BY_CONTENT}
         names += paths
         names += [path for _, path in strips_of(audit.run)][:strips]

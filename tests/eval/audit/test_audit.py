@@ -5,6 +5,8 @@ import hashlib
 import json
 import re
 import shutil
+from collections import Counter
+from math import comb
 
 import mujoco
 import numpy as np
@@ -15,7 +17,9 @@ from made_folders import stored
 
 from arena_newton import policies
 from arena_newton.eval.__main__ import main
-from arena_newton.eval.records.chain import head
+from arena_newton.eval.audit import folder_audit
+from arena_newton.eval.audit.draws import drawn, found_probability
+from arena_newton.eval.records.chain import head, joint_head
 from arena_newton.eval.records.journal import read_journal
 from arena_newton.eval.workers.shard_merge import merge
 from arena_newton.files.untrusted_files import array_digest
@@ -98,6 +102,47 @@ def test_each_tracker_plays_its_own_episodes_again(honest, tmp_path, capsys):
         assert "replayed 0 of 40" in said
         numbers.add(int(said.removeprefix("--draw ").partition(":")[0]))
     assert len(numbers) == 2
+
+
+def test_a_forged_run_among_many_is_found_as_often_as_said(honest, tmp_path, capsys):
+    """Drawn over all runs, episodes find the forged lines of one with the printed probability, and accuse no other."""
+    root = shutil.copytree(honest, tmp_path / "runs")
+    forge(root / "2", FORGERIES["every failure made a success"])
+    assert main(["audit", str(root), "--all"], factories()) == 1
+    said = capsys.readouterr().out
+    forged = {int(number) for number in re.findall(r"runs/2/episodes.jsonl: episode (\d+): outcome", said)}
+    assert said.count("contradictions 0") == 2 and "3 runs: level self-reported" in said and len(forged) > 3, said
+    audits = [folder_audit.audited(root / name) for name in ("1", "2", "run")]
+    draws = [drawn(audits, 6, number) for number in range(3000)]
+    found = [any(record.index in forged for record in records) for _, records, _ in draws]
+    said_of_it, exact = found_probability(len(forged) / 80, 6), 1 - comb(80 - len(forged), 6) / comb(80, 6)
+    assert abs(np.mean(found) - exact) < 0.05 and 0 < exact - said_of_it < 0.03, (np.mean(found), exact, said_of_it)
+    often = Counter((run, record.index) for chosen in draws for run in range(3) for record in chosen[run])
+    assert len(often) == 80 and np.abs(np.array(list(often.values())) - 3000 * 6 / 80).max() < 80, often
+    other = drawn(audits[::-1], 6, 7)[::-1]  # folders of other names, in another order
+    assert [[one.index for one in records] for records in other] == [[r.index for r in records] for records in draws[7]]
+    for number in (found.index(True), found.index(False)):
+        asked = ["--replay", "6", "--draw", str(number)]
+        assert main(["audit", str(root), *asked], factories()) == int(found[number])
+        said = capsys.readouterr().out
+        level = "self-reported" if found[number] else "replayed"
+        assert f"3 runs: level {level}, " in said and "episodes 80 of 80, replayed 6 of 80" in said, said
+        assert said.count("6 episodes played again: that finds a forged line with 6% if 1% are forged") == 1, said
+
+
+def test_the_head_of_many_runs_is_held(honest, tmp_path, capsys):
+    """The head that was published with the numbers of several runs is theirs together; another one contradicts."""
+    audits = [folder_audit.audited(honest / name) for name in ("1", "2", "run")]
+    joint = joint_head([one.head for one in audits])
+    assert audit(honest, capsys, "--head", joint, "--out", str(tmp_path)) == (0, [])
+    page = (tmp_path / "audit.md").read_text()
+    assert (
+        page.startswith("# Audit\n\n## 3 runs: consistent\n") and f"| head | {joint} |\n| episodes | 80 of 80" in page
+    )
+    assert audit(honest, capsys, "--head", audits[0].head) == (
+        1,
+        [f"  contradiction: {honest}: head is {joint}, published was {audits[0].head}"],
+    )
 
 
 def test_a_window_is_no_contradiction(honest, capsys):

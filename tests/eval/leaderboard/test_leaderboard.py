@@ -398,7 +398,7 @@ def few(entry):
     with zipfile.ZipFile(entry / "bundle.zip") as archive:
         archive.extractall(entry.parent / "run")
     (found,) = [folder_audit.audited(entry.parent / "run")]
-    stated(entry, draw=7, played=[one.index for one in drawn(found, 2, 7)], asked=2)
+    stated(entry, draw=7, played=[one.index for one in drawn([found], 2, 7)[0]], asked=2)
 
 
 def picked(entry):
@@ -406,6 +406,49 @@ def picked(entry):
     few(entry)
     ((_, content),) = json.loads((entry / "audit.json").read_text()).items()
     stated(entry, played=[number for number in range(16) if number not in content["played"]][:2])
+
+
+class Kin(FakePolicy):
+    """A policy of other code."""
+
+
+def entry_of_three(runs, entry, policy):
+    """An entry of three runs of which twenty episodes were played again, none of the second; audits, and the number."""
+    few = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "1", "--mode", "semantic"]
+    assert main([*few, "--out", str(runs / "semantic")], factories(policy=policy)) == 0
+    audits = [folder_audit.audited(runs / name) for name in ("base", "semantic", "visual")]
+    draw = next(number for number in range(99) if not drawn(audits, 20, number)[1])
+    asked = ["--replay", "20", "--draw", str(draw), "--policy", "expert", "--out", str(entry)]
+    assert main(["audit", str(runs), *asked], factories()) == 0
+    assert main(["bundle", str(runs), "--out", str(entry)]) == 0
+    fill(entry, checked="eval audit", **KEYS)
+    return audits, draw
+
+
+def test_a_level_is_of_all_runs_together(made, tmp_path, capsys):
+    """Episodes are drawn over all runs of an entry; their actions alone come along, and those of one run earn less."""
+    runs, entry = tmp_path / "runs", tmp_path / "ours"
+    shutil.copytree(made.parent / "run", runs / "base")
+    assert main([*FLAGS, "--repeats", "6", "--mode", "visual", "--out", str(runs / "visual")], factories()) == 0
+    audits, draw = entry_of_three(runs, entry, FakePolicy)
+    assert "3 runs: level re-run" in capsys.readouterr().out
+    with zipfile.ZipFile(entry / "bundle.zip") as archive:
+        assert sum(name.endswith(".npz") for name in archive.namelist()) == 20
+    code, said, site = build(entry, capsys, "--replay", "2", "--draw", "1")
+    assert code == 0 and "ours: re-run, 9 rates" in said, said
+    text = (site / "ours.html").read_text()
+    assert "41 episodes, 2 played again" in text and "20 of 41 episodes played again, by draw" in text
+    content = json.loads((entry / "audit.json").read_text())
+    alone = {str(runs / "visual"): [one.index for one in drawn(audits[2:], 20, draw)[0]]}
+    for name, run in content.items():  # twenty that the number draws by the head of one run, and none of the others
+        run |= {"played": (played := alone.get(name, [])), "asked": len(played)}
+    (entry / "audit.json").write_text(json.dumps(content))
+    code, said, _ = build(entry, capsys)
+    assert code == 2 and f"played is not what draw {draw} draws by the head of all runs" in said
+    shutil.rmtree(runs / "semantic")
+    entry_of_three(runs, tmp_path / "kin", Kin)  # a run of another policy, of which no episode was drawn
+    fill(tmp_path / "kin", level="re-run")
+    assert "evidence gives replayed: config.json: policy_facts: " in build(tmp_path / "kin", capsys)[1]
 
 
 def actions_left_out(members):
@@ -503,11 +546,10 @@ def test_text_of_an_entry_stays_text(entry, capsys):
 
 
 def test_every_entry_of_the_repository_is_sound(tmp_path, monkeypatch, capsys):
-    """The entries in leaderboard/ pass schema and audit, the experts' a replay too, and the board names each."""
+    """The entries in leaderboard/ pass schema, audit and a replay, and the board names each."""
     monkeypatch.chdir(ROOT)
-    replayed = ["leaderboard/expert", "--replay", "1", "--draw", "10", "--out", str(tmp_path / "experts")]
-    assert main(["leaderboard", "build", *replayed]) == 0, capsys.readouterr().out
-    assert main(["leaderboard", "build", "--out", str(tmp_path / "site")]) == 0, capsys.readouterr().out
+    flags = ["--replay", "1", "--draw", "10", "--out", str(tmp_path / "site")]
+    assert main(["leaderboard", "build", *flags]) == 0, capsys.readouterr().out
     text = (tmp_path / "site" / "index.html").read_text()
     entries = [path.parent.name for path in (ROOT / "leaderboard").glob("*/entry.toml")]
     assert len(entries) >= 9 and all(f'href="{name}.html"' in text for name in entries)
