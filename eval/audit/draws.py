@@ -53,7 +53,7 @@ def found_probability(forged: float, episodes: int) -> float:
 
 
 def found_by(episodes: int, of: int) -> str:
-    """What so many drawn episodes find, in words.
+    """Forged lines that so many drawn episodes show, and how probably, in words.
 
     Args:
         episodes: Number of them.
