@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from arena_newton.kernels.pictures.lighting import FULL_LIGHT
-from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, FIRST_SHAPE
+from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, FIGURES, FIRST_SHAPE
 from arena_newton.tasks.base import KEY_OBJECT
 
 __all__ = ["SEMANTIC_COLOURS", "USUAL", "Changes", "changed_looks", "goal_colour", "hue_lacks", "luminance", "palette"]
@@ -103,6 +103,10 @@ class Changes:
     """New colours of what the task is about, where its form tells it apart (`TaskSpec.recolour` is `GOAL_OBJECT`)."""
     flat: float = 0.0
     """A part of its texture and shading less, of each shape that gets another colour."""
+    figures: float = 0.0
+    """Each of four ellipses or boxes with a colour or a pattern of its own, as furniture that no scene of training has."""
+    tones: float = 0.0
+    """A pattern in tones of one colour, as of sand or wood, of each shape that gets another look."""
 
     def chances(self, own: torch.Tensor) -> torch.Tensor:
         """Probability of another colour of shapes whose films say `own`."""
@@ -208,6 +212,9 @@ def changed_looks(
     chance, free = changes.chances(chances), (chances >= 1.0).gather(1, shapes)
     pixels = seen.reshape(batch, -1, 3).float()
     luma = luminance(pixels)
+    if changes.figures:
+        shapes, luma = _with_figures(shapes, luma, free, (height, width), changes.figures)
+        chance = torch.cat([chance[:, :-FIGURES], torch.ones_like(chance[:, :FIGURES])], dim=1)
     original = pixels = pixels.div_(255.0)
     sums = shape_sums(luma, shapes)
     pixels = recoloured(pixels, luma, shapes, sums, chance, objects, colours, (height, width), changes)
@@ -258,13 +265,19 @@ def recoloured(
     mine = torch.rand((batch, SHAPES), device=device).gather(1, part) < rate * chance
     which = _pattern(part, shapes, size, changes.patterns)
     three = _colours(3 * SHAPES, colours).view(batch, SHAPES, 9).take_along_dim(part[..., None], 1)
+    tone = torch.ones((), device=device)
+    if changes.tones:
+        draws = torch.rand((2, batch, SHAPES), device=device).gather(2, part.expand(2, -1, -1))
+        tonal, spread = draws.gather(2, shapes.expand(2, -1, -1))
+        tone = 1.0 + (tonal < changes.tones) * spread * 0.3 * which
+        which = which * (tonal >= changes.tones)
     chosen = three.view(batch, -1, 3).take_along_dim((3 * shapes + which)[..., None], 1)
     light, count = torch.zeros_like(sums).scatter_add_(2, part.expand_as(sums), sums).gather(2, part.expand_as(sums))
     shade = _over(luma, (light / count.clamp_min(1)).gather(1, shapes))
     if changes.flat:
         less = (torch.rand((batch, SHAPES), device=device) / changes.flat).clamp_max_(1.0)
         shade = shade.pow_(less.gather(1, part).gather(1, shapes))
-    shade = shade[..., None]
+    shade = (shade * tone)[..., None]
     return torch.where(mine.gather(1, shapes)[..., None], chosen.mul_(shade).clamp_(0.0, 1.0), pixels)
 
 
@@ -395,6 +408,26 @@ def _with_things(
     shade = _over(luma.view(-1)[source], light / area.clamp_min(1))
     colour = _colours(1, colours) * shade[..., None]
     return torch.where(put[..., None], colour.clamp_(0.0, 1.0), pixels)
+
+
+def _with_figures(
+    shapes: torch.Tensor, luma: torch.Tensor, free: torch.Tensor, size: tuple[int, int], probability: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shapes and luminance of pictures with ellipses and boxes, the last shapes, upright before what may be hidden.
+
+    They are shaded from one side to the other, and get their colours with all other shapes, or none and do not show.
+    """
+    (height, width), (batch, _), device = size, shapes.shape, shapes.device
+    middle, half, kind = torch.rand((5, batch, FIGURES, 1, 1), device=device).split((2, 2, 1))
+    half = 0.015 * torch.exp2(4.2 * half)  # to 0.28 of the picture's side
+    down = (torch.arange(height, device=device).view(-1, 1) / height - middle[0]) / half[0]
+    right = (torch.arange(width, device=device) / width - middle[1]) / half[1]
+    inside = torch.where(kind[0] < 0.5, down**2 + right**2, torch.maximum(down.abs(), right.abs()) ** 2) < 1.0
+    inside &= torch.rand((batch, FIGURES, 1, 1), device=device) < probability
+    number = torch.arange(SHAPES - FIGURES, SHAPES, device=device).view(1, -1, 1, 1)
+    top = (inside * number).amax(dim=1).reshape(batch, -1) * free
+    shaded = (inside * (160.0 + 60.0 * right.clamp(-1.0, 1.0))).amax(dim=1).reshape(batch, -1).long()
+    return torch.where(top > 0, top, shapes), torch.where(top > 0, shaded, luma)
 
 
 def _rectangles(batch: int, height: int, width: int, device: torch.device) -> torch.Tensor:

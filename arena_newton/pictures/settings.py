@@ -27,6 +27,7 @@ __all__ = [
     "recorded_camera",
     "robot_fit",
     "video_sizes",
+    "FIGURES",
     "FIRST_SHAPE",
 ]
 
@@ -36,6 +37,8 @@ DOME_COLOR = (0.75, 0.75, 0.75)
 """Colour of the original's dome light, linear RGB."""
 FIRST_SHAPE = 2
 """First byte of a frame of looks that names a shape; 0 is the background, 1 the robot."""
+FIGURES = 4
+"""The last bytes are of no shape of a scene, but of figures that a training draws into its pictures."""
 Fit = Literal["native", "pad"]
 FRONT = "front"
 """Name of the head camera in datasets, and of its picture among those that a policy observes."""

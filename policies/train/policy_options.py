@@ -78,7 +78,7 @@ class PolicyTrainOptions:
     that were recorded with `eval record --looks`."""
     look_changes: Several[str] = ()
     """Probabilities of the kinds of change in such a sample, as light=0 things=0; the usual ones of those that are not
-    named: colours patterns light things rectangles exposure key_objects goals flat."""
+    named: colours patterns light things rectangles exposure key_objects goals flat figures tones."""
     recipe_values: Several[str] = ()
     """Values of the recipe that no other flag has, as frozen_norms=0.3 shift_px=0 network.dim_model=384."""
     task_vector: bool = False

@@ -171,6 +171,39 @@ def test_flat_shapes_lose_texture(batch):
     assert (spread[0.5] <= spread[0.0] + 1e-9).all()
 
 
+def test_tones_are_of_one_colour(batch):
+    """The pixels of an evenly lit shape in a pattern of tones differ in their luminance alone."""
+    seen, frames, *rest = batch
+    torch.manual_seed(6)
+    wall = frames[..., 0] == WALL
+    tonal = Changes(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, tones=1.0)
+    found = changed_looks(torch.full_like(seen, 120), frames, *rest, tonal)
+    pixels = [one[shown] for one, shown in zip(found, wall, strict=True)]
+    hues = [one / one.amax(dim=1, keepdim=True) for one in pixels if float(one.max()) < 0.99]
+    assert len(hues) > 5 and max(float((one - one[0]).abs().max()) for one in hues) < 1e-4
+    assert any(len(one.amax(dim=1).unique()) > 1 for one in pixels)
+
+
+def test_figures_stand_before_what_may_be_hidden_alone(batch):
+    """Walls and floor are partly hidden by figures in colours of the palette, and nothing else changes."""
+    seen, frames, *_ = batch
+    torch.manual_seed(4)
+    bare = torch.zeros_like(batch[2])
+    bare[:, WALL], bare[:, FLOOR] = 1.0, 1.0
+    figures = Changes(1.0, 0.3, 0.0, 0.0, 0.0, 0.0, key_objects=0.0, figures=0.9)
+    off = replace(figures, figures=0.0)
+    hidden = 0.0
+    for _ in range(5):
+        changed = changed_looks(seen, frames, bare, *batch[3:], figures)
+        assert not differ(changed, seen)[frames[..., 0] > FLOOR].any() and not differ(changed, seen)[:, :2].any()
+        even = torch.full_like(seen, 120)
+        spans = [
+            len(coded(changed_looks(even, frames, bare, *batch[3:], kind)).unique()) / BATCH for kind in (figures, off)
+        ]
+        hidden += spans[0] > spans[1]
+    assert hidden >= 4, "pictures with figures have more colours"
+
+
 def test_nothing_gets_the_colour_of_a_goal_that_is_told_by_it(batch):
     """Beside a green goal no shape, thing or rectangle is drawn in a green; beside a grey one all colours may be."""
     seen, frames, chances, *rest = batch

@@ -22,7 +22,7 @@ import numpy as np
 
 from arena_newton.errors import InputError
 from arena_newton.files.stored_json import Fit, Json, loaded, read_object, shown
-from arena_newton.pictures.settings import FIRST_SHAPE
+from arena_newton.pictures.settings import FIGURES, FIRST_SHAPE
 
 __all__ = ["FIRST_SHAPE", "LOOKS_FOLDER", "MOST_LIGHTS", "MOST_SHAPES", "SCHEMA", "DatasetLooks", "Looks"]
 __all__ += ["dataset_looks", "described_looks", "film_path"]
@@ -31,8 +31,8 @@ SCHEMA = "arena_looks_v1"
 """Version of films and their description."""
 LOOKS_FOLDER = "looks"
 """Folder of a dataset's films and of their list."""
-MOST_SHAPES = 256 - FIRST_SHAPE
-"""Shapes that bytes can name."""
+MOST_SHAPES = 256 - FIGURES - FIRST_SHAPE
+"""Shapes that bytes can name; the last bytes are of figures that a training draws."""
 MOST_LIGHTS = 2
 """Second lights of an episode: a picture has three channels."""
 

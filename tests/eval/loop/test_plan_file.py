@@ -56,7 +56,7 @@ def test_rows_of_the_generalist_are_its_ablation():
     expected |= {name: {"look_changes"} for name in ("shapes", "light", "keys-seldom")}
     expected |= {
         "goals": {"looks", "look_changes"},
-        "bold": {"looks", "look_changes"},
+        **dict.fromkeys(("bold", "figures"), {"looks", "look_changes", "task_weights"}),
         "plain-02": {"looks"},
         "plain-06": {"looks"},
         "untold": {"tracker_vector"},
