@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd
 
-from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.boxing import TASK
-from scene_builders import author, decor, rooms, warehouse
+from scene_builders import author, rooms, warehouse
 from scene_builders.solids import Solids
 
 BAG_RADIUS = 0.155
@@ -63,49 +62,50 @@ def _bag(stage: Usd.Stage, name: str, centre: author.Vec, skin: Usd.Prim, metal:
 
 
 def _semantic_2(folder: Path) -> None:
-    """A dojo: straw mats, paper walls, a plum and a white bag on wooden posts, a pale green disc with a hub."""
+    """A fitness studio: speckled rubber, peach over plum, an orange and a navy bag on white posts, a green diamond."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="tatami")
-        rooms.look(stage, "Wall", texture="shoji")
-        rooms.look(stage, "Skirting", (0.1, 0.045, 0.02))
-        rooms.look(stage, "BagBlack", (0.26, 0.02, 0.1))
-        rooms.look(stage, "BagRed", (0.75, 0.72, 0.64))
-        rooms.look(stage, "Metal", (0.3, 0.15, 0.06))
-        green, hub = rooms.look(stage, "TargetGreen", (0.12, 0.8, 0.2)), rooms.look(stage, "Hub", (0.9, 0.9, 0.85))
-        frame, width = "/World/Target/Frame", 2 * TARGET_RADIUS
+        rooms.look(stage, "Floor", texture="rubber")
+        rooms.look(stage, "Wall", texture="studio")
+        rooms.look(stage, "Skirting", (0.06, 0.06, 0.08))
+        rooms.look(stage, "BagBlack", (0.75, 0.24, 0.03))
+        rooms.look(stage, "BagRed", (0.02, 0.05, 0.24))
+        rooms.look(stage, "Metal", (0.7, 0.7, 0.72))
+        frame, r = "/World/Target/Frame", TARGET_RADIUS
         rooms.without(stage, f"{frame}/Ball")
-        author.cylinder(stage, f"{frame}/Disc", TARGET_RADIUS, width - 0.002, axis="Y", collide=False, look=green)
-        author.cylinder(stage, f"{frame}/Hub", 0.25 * TARGET_RADIUS, width, axis="Y", collide=False, look=hub)
+        gem = Solids()
+        for tip in (-r, r):
+            gem.tube((0, 0, 0), (0, 0, tip), r, taper=0.01, sides=8)
+        gem.write(stage, f"{frame}/Gem", look=rooms.look(stage, "TargetGreen", (0.03, 0.8, 0.08)))
+        rack, weights = Solids(), Solids()
+        for z in (0.3, 0.75):
+            rack.box((0.75, 0.16, 0.02), (-5.0, -6.2, z))
+            for x in np.linspace(-5.6, -4.4, 5):
+                weights.tube((x, -6.34, z + 0.1), (x, -6.06, z + 0.1), 0.08, sides=12)
+        for x in (-5.72, -4.28):
+            rack.box((0.03, 0.2, 0.45), (x, -6.2, 0.45))
+        rack.write(stage, "/World/Rack", look=rooms.look(stage, "Rack", (0.5, 0.52, 0.55)))
+        weights.write(stage, "/World/Weights", look=rooms.look(stage, "Weights", (0.03, 0.25, 0.35)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """An indoor track: red lanes, block walls over blue mats, a lilac and a banded bag, a dark green cross, hurdles."""
+    """A circus tent: sawdust, striped canvas, a leather and a blue bag on gilt posts, a green drum, podiums."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="track")
-        rooms.look(stage, "Wall", texture="blocks")
-        rooms.look(stage, "Skirting", (0.3, 0.3, 0.32))
-        rooms.look(stage, "BagBlack", (0.52, 0.44, 0.66))
-        rooms.look(stage, "BagRed", (0.85, 0.6, 0.08))
-        rooms.look(stage, "Metal", (0.1, 0.22, 0.4))
-        decor.dado(stage, "/World/Mats", *ROOM, 0.8, look=rooms.look(stage, "WallMat", (0.04, 0.16, 0.42)))
-        lanes = [((3.85, 0.025, 0.001), (-3.3, y, 0.003)) for y in (-5.6, -4.6, -3.6, -2.6, -1.6)]
-        warehouse.boxes(stage, "/World/Lanes", lanes, look=rooms.look(stage, "Lane", (0.85, 0.83, 0.78)))
-        bands = Solids()
-        for z in (0.62, 0.94):
-            bands.tube((0, 0, z), (0, 0, z + 0.14), BAG_RADIUS + 0.002, sides=24)
-        bands.write(stage, "/World/Bag_2/Bands", look=rooms.look(stage, "BagBand", (0.05, 0.05, 0.07)))
-        frame, thin = "/World/Target/Frame", 0.42 * TARGET_RADIUS
+        rooms.look(stage, "Floor", texture="sawdust")
+        rooms.look(stage, "Wall", texture="tent")
+        rooms.look(stage, "Skirting", (0.1, 0.05, 0.2))
+        rooms.look(stage, "BagBlack", (0.22, 0.08, 0.03))
+        rooms.look(stage, "BagRed", (0.03, 0.14, 0.5))
+        rooms.look(stage, "Metal", (0.62, 0.42, 0.06))
+        frame, width = "/World/Target/Frame", 2 * TARGET_RADIUS
         rooms.without(stage, f"{frame}/Ball")
-        cross = Solids()
-        for axis in range(3):
-            cross.box(tuple(TARGET_RADIUS if k == axis else thin for k in range(3)))
-        cross.write(stage, f"{frame}/Cross", look=rooms.look(stage, "TargetGreen", (0.0, 0.34, 0.06)))
-        hurdles = Solids()
-        for x in (-5.9, -4.7):
-            hurdles.box((0.5, 0.02, 0.06), (x, -5.9, 0.8))
-            for side in (-0.45, 0.45):
-                hurdles.box((0.02, 0.02, 0.4), (x + side, -5.9, 0.4)).box((0.02, 0.25, 0.02), (x + side, -5.7, 0.02))
-        hurdles.write(stage, "/World/Hurdles", look=rooms.look(stage, "Hurdle", (0.85, 0.85, 0.82)))
+        green = rooms.look(stage, "TargetGreen", (0.14, 0.72, 0.03))
+        author.cylinder(stage, f"{frame}/Drum", TARGET_RADIUS, width, collide=False, look=green)
+        podiums, tops = Solids(), Solids()
+        for x, y, radius in ((-5.2, -5.7, 0.6), (-4.1, -6.0, 0.4), (-0.1, -5.6, 0.4), (-5.6, -3.6, 0.4)):
+            podiums.tube((x, y, 0), (x, y, 0.5), radius, taper=0.8, sides=24, tile=0.5)
+            tops.ring(0.0, 0.8 * radius, (x, y, 0.5))
+        podiums.write(stage, "/World/Podiums", look=rooms.look(stage, "Podium", texture="podium"))
+        tops.write(stage, "/World/PodiumTops", look=rooms.look(stage, "PodiumTop", (0.6, 0.05, 0.05)))
 
 
 def build(folder: Path) -> None:

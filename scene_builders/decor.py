@@ -2,43 +2,26 @@
 
 from pxr import Usd
 
-from scene_builders import author, rooms, warehouse
+from scene_builders import author, rooms
 from scene_builders.author import Vec
 from scene_builders.solids import Solids
 
-__all__ = ["dado", "parasol", "stool", "topiary"]
+__all__ = ["conifer", "topiary"]
 
 
-def dado(stage: Usd.Stage, path: str, low: Vec, high: Vec, height: float, *, look: Usd.Prim, tile: float = 1.0) -> None:
-    """Panelling, tiles or mats along the walls of the room `low`…`high` (x, y) up to `height`, 1 cm before them [m]."""
-    (x0, y0), (x1, y1), t, h = low, high, 0.005, height / 2
-    parts = [(((x1 - x0) / 2, t, h), ((x0 + x1) / 2, y, h)) for y in (y0 + t, y1 - t)]
-    parts += [((t, (y1 - y0) / 2, h), (x, (y0 + y1) / 2, h)) for x in (x0 + t, x1 - t)]
-    warehouse.boxes(stage, path, parts, look=look, tile=tile)
-
-
-def parasol(stage: Usd.Stage, path: str, position: Vec, color: Vec) -> None:
-    """A sunshade on a pole in a heavy foot."""
+def conifer(stage: Usd.Stage, path: str, position: Vec, height: float, *, needles: Vec) -> None:
+    """A fir of three tiers, `height` [m] tall; colour of its needles, linear RGB."""
     author.xform(stage, path, position)
-    pole = Solids().tube((0, 0, 0), (0, 0, 2.2), 0.025).tube((0, 0, 0), (0, 0, 0.12), 0.3, taper=0.5)
-    pole.write(stage, f"{path}/Pole", look=rooms.look(stage, "ParasolPole", (0.8, 0.78, 0.7)))
-    roof = Solids().tube((0, 0, 1.75), (0, 0, 2.2), 1.1, taper=0.02, sides=8)
-    roof.write(stage, f"{path}/Roof", look=rooms.look(stage, f"{path.rpartition('/')[2]}Roof", color))
-
-
-def stool(stage: Usd.Stage, path: str, positions: list[Vec], *, seat: Vec, legs: Vec) -> None:
-    """Round stools on four splayed legs, in the colours of seats and legs, linear RGB."""
-    seats, bars = Solids(), Solids()
-    for x, y in positions:
-        seats.tube((x, y, 0.44), (x, y, 0.48), 0.17, sides=16).ring(0.0, 0.17, (x, y, 0.48))
-        for sx, sy in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
-            bars.tube((x + 0.16 * sx, y + 0.16 * sy, 0), (x + 0.09 * sx, y + 0.09 * sy, 0.44), 0.015, sides=6)
-    seats.write(stage, f"{path}Seats", look=rooms.look(stage, "StoolSeat", seat))
-    bars.write(stage, f"{path}Legs", look=rooms.look(stage, "StoolLegs", legs))
+    trunk = Solids().tube((0, 0, 0), (0, 0, 0.3 * height), 0.04 * height)
+    trunk.write(stage, f"{path}/Trunk", look=rooms.look(stage, "Trunk", (0.14, 0.07, 0.03)))
+    crown = Solids()
+    for low, top, radius in ((0.14, 0.55, 0.3), (0.38, 0.78, 0.23), (0.62, 1.0, 0.16)):
+        crown.tube((0, 0, low * height), (0, 0, top * height), radius * height, taper=0.02, sides=12)
+    crown.write(stage, f"{path}/Crown", look=rooms.look(stage, "Needles", needles))
 
 
 def topiary(stage: Usd.Stage, path: str, position: Vec, height: float, *, crown: Usd.Prim) -> None:
-    """A tree clipped to a ball in a square tub, `height` [m] tall."""
+    """A bush in a square tub, `height` [m] tall."""
     author.xform(stage, path, position)
     tub = Solids().box((0.16 * height, 0.16 * height, 0.14 * height), (0, 0, 0.14 * height))
     tub.write(stage, f"{path}/Tub", look=rooms.look(stage, "Tub", (0.42, 0.14, 0.06)))

@@ -10,7 +10,7 @@ import numpy as np
 from pxr import Usd
 
 from arena_newton.tasks.double_desk import TASK
-from scene_builders import author, decor, rooms, warehouse
+from scene_builders import author, decor, rooms
 from scene_builders.solids import Solids
 
 __all__ = ["build"]
@@ -111,45 +111,48 @@ def _hammer_looks(
 
 
 def _semantic_2(folder: Path) -> None:
-    """A craft room: ochre linoleum, coral walls, cutting mats on red legs, yellow basket, orange and black hammer."""
+    """A garage: checked floor, corrugated walls, chipboard on yellow legs, red basket, blue hammer, tyres and drums."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "concrete", texture="linoleum")
-        rooms.look(stage, "charcoal", (0.72, 0.28, 0.2))
-        rooms.look(stage, "glass", (0.6, 0.72, 0.62))
-        rooms.look(stage, "bench_steel", (0.42, 0.03, 0.03))
-        rooms.look(stage, "sill", (0.06, 0.05, 0.12))
-        rooms.look(stage, "crate", (0.85, 0.55, 0.03))
-        rooms.look(stage, "crate_trim", (0.2, 0.09, 0.03))
-        _hammer_looks(stage, (0.8, 0.2, 0.02), (0.55, 0.56, 0.58), (0.02, 0.02, 0.02), [(-0.145, -0.03)])
-        mat = rooms.look(stage, "mat", texture="mat")
+        rooms.look(stage, "concrete", texture="checks")
+        rooms.look(stage, "charcoal", texture="sheet")
+        rooms.look(stage, "glass", (0.1, 0.16, 0.25))
+        rooms.look(stage, "bench_steel", (0.75, 0.46, 0.02))
+        rooms.look(stage, "sill", (0.1, 0.1, 0.11))
+        rooms.look(stage, "crate", (0.6, 0.05, 0.03))
+        rooms.look(stage, "crate_trim", (0.04, 0.04, 0.05))
+        spans = [(y - 0.012, y + 0.012) for y in (-0.12, -0.07)]
+        _hammer_looks(stage, (0.02, 0.09, 0.5), (0.5, 0.51, 0.53), (0.02, 0.02, 0.02), spans)
+        board = rooms.look(stage, "chipboard", texture="chipboard")
         for name, corners in DESKS.items():
-            rooms.bench_cover(stage, f"/World/{name}", *corners, look=mat, tile=0.8)
-        panel = rooms.look(stage, "panelling", (0.7, 0.66, 0.55))
-        decor.dado(stage, "/World/Panelling", ROOM_LOW, ROOM_HIGH, 0.9, look=panel)
-        sheets = [((0.01, 0.35, 0.25), (ROOM_HIGH[0], y, 1.3)) for y in (-5.0, -3.9, -2.8, -1.7, -0.6, 0.5)]
-        warehouse.boxes(stage, "/World/Drawings", sheets, look=rooms.look(stage, "drawing", (0.15, 0.4, 0.75)))
-        decor.stool(stage, "/World/Stool", [(1.2, -4.4), (1.3, 0.6)], seat=(0.05, 0.3, 0.4), legs=(0.6, 0.4, 0.2))
+            rooms.bench_cover(stage, f"/World/{name}", *corners, look=board, tile=0.8)
+        tyres, drums = Solids(), Solids()
+        for x, y, count in ((1.4, -0.7, 3), (1.3, -1.6, 2), (1.4, -4.6, 4)):
+            for number in range(count):
+                z = 0.22 * number
+                tyres.tube((x, y, z), (x, y, z + 0.2), 0.33, sides=20).ring(0.17, 0.33, (x, y, z + 0.2))
+        for x, y in ((1.5, -2.6), (1.4, 0.9)):
+            drums.tube((x, y, 0), (x, y, 0.88), 0.29, sides=20).ring(0.0, 0.29, (x, y, 0.88))
+        tyres.write(stage, "/World/Tyres", look=rooms.look(stage, "tyre", (0.025, 0.025, 0.028)))
+        drums.write(stage, "/World/Drums", look=rooms.look(stage, "drum", (0.04, 0.3, 0.2)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A bakery: dark red tiles, glazed green walls, maple tops on white legs, blue basket, teal hammer, flour sacks."""
+    """A greenhouse: mossy slabs, glass walls, grey slats on dark green legs, pine basket, red hammer, tomato plants."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "concrete", texture="quarry")
-        rooms.look(stage, "charcoal", texture="metro")
-        rooms.look(stage, "glass", (0.85, 0.75, 0.5))
-        rooms.look(stage, "bench_steel", (0.72, 0.72, 0.7))
-        rooms.look(stage, "sill", (0.6, 0.42, 0.12))
-        rooms.look(stage, "crate", (0.03, 0.12, 0.5))
-        rooms.look(stage, "crate_trim", (0.75, 0.78, 0.82))
-        spans = [(y - 0.006, y + 0.006) for y in (-0.13, -0.105, -0.08, -0.055, -0.03, 0.09)]
-        _hammer_looks(stage, (0.0, 0.35, 0.36), (0.03, 0.03, 0.035), (0.9, 0.88, 0.8), spans)
-        butcher = rooms.look(stage, "butcher", texture="butcher")
+        rooms.look(stage, "concrete", texture="slabs")
+        rooms.look(stage, "charcoal", texture="panes")
+        rooms.look(stage, "glass", (0.8, 0.9, 0.95))
+        rooms.look(stage, "bench_steel", (0.02, 0.13, 0.06))
+        rooms.look(stage, "sill", (0.45, 0.16, 0.08))
+        rooms.look(stage, "crate", (0.6, 0.38, 0.17))
+        rooms.look(stage, "crate_trim", (0.3, 0.15, 0.05))
+        _hammer_looks(stage, (0.55, 0.03, 0.03), (0.05, 0.05, 0.06), (0.85, 0.82, 0.7), [(-0.14, -0.05)])
+        slats = rooms.look(stage, "slats", texture="slats")
         for name, corners in DESKS.items():
-            rooms.bench_cover(stage, f"/World/{name}", *corners, look=butcher, tile=0.8)
-        sack = rooms.look(stage, "sack", (0.55, 0.4, 0.24))
-        for number, (x, y) in enumerate(((1.5, -1.9), (1.6, -2.5), (1.5, -3.1), (-5.2, 1.6))):
-            half = (0.26, 0.2 + 0.05 * (number % 2), 0.27)
-            warehouse.rounded_box(stage, f"/World/Sack_{number}", half, (x, y, 0.27), radius=0.1, look=sack)
+            rooms.bench_cover(stage, f"/World/{name}", *corners, look=slats, tile=0.8)
+        tomato = rooms.look(stage, "tomato", texture="tomato")
+        for number, y in enumerate((-4.8, -3.7, -2.6, -1.2, -0.2, 0.9)):
+            decor.topiary(stage, f"/World/Plant_{number}", (1.5, y, 0), 1.2 + 0.3 * (number % 2), crown=tomato)
 
 
 def build(folder: Path) -> None:

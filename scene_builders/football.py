@@ -106,58 +106,53 @@ def goal(stage: Usd.Stage) -> None:
     author.marker(stage, "/World/Goal/Volume", (5.1, 2.0, 1.85), (0.05, 4.03, 0.925))
 
 
-def _beach(stage: Usd.Stage) -> None:
-    """Sunshades over loungers at both sides of the field."""
-    loungers = Solids()
-    for number, (x, y) in enumerate(((-5.2, 0.6), (-5.4, 3.4), (5.2, 1.4), (5.5, 4.0))):
-        decor.parasol(stage, f"/World/Parasol_{number}", (x, y, 0), ((0.75, 0.1, 0.06), (0.85, 0.7, 0.5))[number % 2])
-        loungers.box((0.3, 0.9, 0.03), (x, y, 0.3)).box((0.25, 0.03, 0.14), (x, y - 0.7, 0.14))
-        loungers.box((0.25, 0.03, 0.14), (x, y + 0.7, 0.14))
-    loungers.write(stage, "/World/Loungers", look=rooms.look(stage, "Lounger", (0.1, 0.3, 0.5)))
-
-
 def _semantic_2(folder: Path) -> None:
-    """A beach: sand, the sea behind, blue tape, red goal with a black net, orange and teal ball, sunshades."""
+    """A school gym: parquet with court lines, wall bars, red and white goal, blue and yellow ball, mats and benches."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        sand = rooms.look(stage, "grass", texture="sand")
-        author.quad(stage, "/World/Floor", 7.0, 7.0, (0, 0, 0), repeat=(5, 5), look=sand)
-        rooms.without(stage, "/World/CentreCircle")
-        tape = [((5.0, 0.05, 0.001), (0, -0.6, 0.003))] + [((0.05, 4.3, 0.001), (x, -1.3, 0.003)) for x in (-4, 4)]
-        warehouse.boxes(stage, "/World/Tape", tape, look=rooms.look(stage, "white", (0.02, 0.12, 0.55)))
+        rooms.without(stage, "/World/Backdrop")
+        warehouse.boxes(stage, "/World/WallBars", BACKDROP, look=rooms.look(stage, "bars", texture="bars"), tile=2.6)
+        key = [((1.3, 0.95, 0.001), (0, -2.65, 0.002))]
+        warehouse.boxes(stage, "/World/Key", key, look=rooms.look(stage, "key", (0.03, 0.22, 0.12)))
+        lines: list[tuple[author.Vec, author.Vec]] = [((4.4, 0.04, 0.001), (0, y, 0.004)) for y in (2.1, -1.7)]
+        lines += [((0.04, 4.6, 0.001), (x, -1.0, 0.005)) for x in (-4.4, 4.4)]
+        warehouse.boxes(stage, "/World/Lines", lines, look=rooms.look(stage, "line", (0.6, 0.04, 0.04)))
+        mats, seats, feet = Solids(), Solids(), Solids()
+        for x, y in ((-5.4, 1.0), (-5.4, 3.6), (5.4, 2.6)):
+            mats.box((0.6, 1.0, 0.15), (x, y, 0.15))
+        for x, y in ((5.3, -0.6), (-5.2, -1.6)):
+            seats.box((0.14, 1.2, 0.02), (x, y, 0.36))
+            for end in (-0.9, 0.9):
+                feet.box((0.12, 0.03, 0.17), (x, y + end, 0.17))
+        mats.write(stage, "/World/Mats", look=rooms.look(stage, "mat", (0.04, 0.12, 0.42)))
+        seats.write(stage, "/World/BenchSeats", look=rooms.look(stage, "bench", (0.5, 0.28, 0.1)))
+        feet.write(stage, "/World/BenchFeet", look=rooms.look(stage, "feet", (0.08, 0.08, 0.09)))
         paint = {
-            "/World/Backdrop": rooms.look(stage, "sea", texture="sea"),
-            "/World/Goal/FrameLook": rooms.look(stage, "red", (0.6, 0.03, 0.02)),
-            "/World/Goal/Net": rooms.look(stage, "black", (0.015, 0.015, 0.02)),
+            "/World/Floor": rooms.look(stage, "grass", texture="parquet"),
+            "/World/CentreCircle": rooms.look(stage, "circle", (0.03, 0.08, 0.42)),
+            "/World/Goal/FrameLook": rooms.look(stage, "handball", texture="goal"),
+            "/World/Goal/Net": rooms.look(stage, "cords", (0.04, 0.1, 0.4)),
             "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
         }
         rooms.paint(stage, paint)
-        _beach(stage)
 
 
 def _semantic_3(folder: Path) -> None:
-    """A schoolyard: asphalt with painted games, the school's front, blue goal with a green net, orange ball, trees."""
+    """A winter pitch: snow with blue lines before a forest, green goal with a red net, pink ball, firs and a bench."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.without(stage, "/World/Backdrop", "/World/CentreCircle")
-        warehouse.boxes(stage, "/World/School", BACKDROP, look=rooms.look(stage, "school", texture="school"), tile=2.6)
-        for name, (x, y), color in (
-            ("Red", (-1.6, -0.2), (0.6, 0.05, 0.04)),
-            ("Yellow", (0.3, -1.2), (0.85, 0.6, 0.04)),
-            ("Blue", (1.9, 0.4), (0.05, 0.3, 0.65)),
-        ):
-            disc = Solids().ring(0.0, 0.55, (x, y, 0.003)).ring(0.62, 0.7, (x, y, 0.003))
-            disc.write(stage, f"/World/{name}Game", look=rooms.look(stage, f"{name}Paint", color))
-        hopscotch = Solids()
-        for number in range(7):
-            for x in (0.0,) if number % 2 else (-0.25, 0.25):
-                hopscotch.box((0.22, 0.22, 0.001), (x - 3.6, 0.5 * number - 2.6, 0.003))
-        hopscotch.write(stage, "/World/Hopscotch", look=rooms.look(stage, "Hopscotch", (0.8, 0.75, 0.65)))
-        leaves = rooms.look(stage, "Leaves", texture="boxwood")
-        for number, (x, y) in enumerate(((-4.6, 3.6), (4.6, 3.6), (5.2, -0.5))):
-            decor.topiary(stage, f"/World/Tree_{number}", (x, y, 0), 1.8, crown=leaves)
+        rooms.without(stage, "/World/Backdrop")
+        warehouse.boxes(stage, "/World/Forest", BACKDROP, look=rooms.look(stage, "forest", texture="forest"), tile=2.6)
+        snow = rooms.look(stage, "grass", texture="snow")
+        author.quad(stage, "/World/Floor", 7.0, 7.0, (0, 0, 0), repeat=(4, 4), look=snow)
+        for number, (x, y, height) in enumerate(((-5.0, 2.4, 2.3), (-5.8, 4.6, 2.9), (5.2, 3.0, 2.6), (5.6, 0.2, 2.0))):
+            decor.conifer(stage, f"/World/Fir_{number}", (x, y, 0), height, needles=(0.02, 0.13, 0.07))
+        for number, (x, y) in enumerate(((-4.8, -0.4), (4.9, -1.6), (5.9, 4.9))):
+            half = (0.5, 0.8, 0.22)
+            warehouse.rounded_box(stage, f"/World/Heap_{number}", half, (x, y, 0.1), radius=0.2, look=snow)
+        blue = rooms.look(stage, "white", (0.03, 0.1, 0.5))
         paint = {
-            "/World/Floor": rooms.look(stage, "grass", texture="asphalt"),
-            "/World/Goal/FrameLook": rooms.look(stage, "azure", (0.03, 0.2, 0.6)),
-            "/World/Goal/Net": rooms.look(stage, "green", (0.02, 0.2, 0.08)),
+            "/World/CentreCircle": blue,
+            "/World/Goal/FrameLook": rooms.look(stage, "pine", (0.02, 0.16, 0.09)),
+            "/World/Goal/Net": rooms.look(stage, "cords", (0.5, 0.03, 0.03)),
             "/World/Ball/Look": rooms.look(stage, "football", texture="ball"),
         }
         rooms.paint(stage, paint)

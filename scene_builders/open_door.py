@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from arena_newton.tasks.open_door import TASK
-from scene_builders import author, decor, rooms, warehouse
+from scene_builders import author, rooms, warehouse
 from scene_builders.solids import Solids
 
 POSITION = (-1.614, 2.314, 0.002)
@@ -194,59 +194,61 @@ def _on_panels(stage: Usd.Stage, name: str, height: float, out: float, look: Usd
 
 
 def _semantic_2(folder: Path) -> None:
-    """A hotel: blue carpet with diamonds, damask over dark panelling, a numbered mahogany door and a golden bench."""
+    """A barn: straw, dark timber, red boards with white posts, a pale door with green braces, bales."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="diamonds")
-        rooms.look(stage, "Wall", (0.3, 0.04, 0.08))
-        rooms.look(stage, "Skirting", (0.08, 0.03, 0.02))
-        for name in ("Panel", "Trim"):
-            rooms.look(stage, name, (0.5, 0.34, 0.1))
-        rooms.look(stage, "Rail", (0.07, 0.025, 0.015))
-        rooms.look(stage, "Leaf", texture="mahogany")
-        bright = rooms.look(stage, "Chrome", (0.7, 0.68, 0.62), roughness=0.3)
-        _on_panels(stage, "Damask", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Damask", texture="damask"), 1.0)
-        _on_panels(stage, "Panelling", 0.9, 0.004, rooms.look(stage, "Panelling", (0.09, 0.035, 0.02)), 1.0)
-        leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.002
+        straw = rooms.look(stage, "Floor", texture="straw")
+        rooms.look(stage, "Wall", (0.12, 0.055, 0.03))
+        rooms.look(stage, "Skirting", (0.3, 0.28, 0.25))
+        for name in ("Panel", "Trim", "Rail"):
+            rooms.look(stage, name, (0.75, 0.72, 0.65))
+        rooms.look(stage, "Leaf", (0.6, 0.5, 0.34))
+        rooms.look(stage, "Chrome", (0.02, 0.02, 0.022), roughness=0.5)
+        _on_panels(stage, "Boards", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Boards", texture="barn"), 1.0)
+        leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.006
         rooms.without(stage, f"{leaf}/Mouldings")
-        fields = [((0.16, y, hz), (x, 0, z)) for x in (0.27, 0.73) for hz, z in ((0.3, 0.46), (0.2, 1.72))]
-        warehouse.boxes(stage, f"{leaf}/Fields", fields, look=rooms.look(stage, "Fields", (0.16, 0.045, 0.02)))
-        plate = [((0.09, y + 0.001, 0.05), (0.5, 0, 1.4)), ((0.035, y + 0.003, 0.11), (0.93, 0, 0.95))]
-        warehouse.boxes(stage, f"{leaf}/Plates", plate, look=bright)
-        seat = [((0.5, 0.18, 0.06), (-1.7, -0.28, 0.42))]
-        seat += [((0.03, 0.14, 0.18), (x, -0.28, 0.18)) for x in (-2.1, -1.3)]
-        warehouse.boxes(stage, f"{frame}/Bench", seat, look=rooms.look(stage, "BenchSeat", (0.5, 0.36, 0.1)))
+        braces = Solids()
+        for z in (0.14, 1.1, 2.02):
+            braces.box((0.48, y, 0.07), (0.5, 0, z))
+        for side in (-1, 1):
+            for low, high in ((0.21, 1.03), (1.17, 1.95)):
+                start, end = (0.1, side * (y - 0.002), low), (0.9, side * (y - 0.002), high)
+                braces.cord(start, end, 0.13, (0, 1, 0))
+        braces.write(stage, f"{leaf}/Braces", look=rooms.look(stage, "Braces", (0.02, 0.14, 0.06)))
+        bales = [((0.5, 0.24, 0.22), (x, -0.36, z)) for x, z in ((-2.0, 0.22), (-3.1, 0.22), (-2.5, 0.66), (2.2, 0.22))]
+        warehouse.boxes(stage, f"{frame}/Bales", bales, look=straw, tile=0.8)
 
 
 def _semantic_3(folder: Path) -> None:
-    """A clinic: green vinyl with guide lines, white over blue walls, a yellow door with a slim pane and a red lever."""
+    """Swimming baths: sandy tiles, pool mosaic, a coral door with a porthole, a white lever, bench and lifebuoy."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="vinyl")
-        rooms.look(stage, "Wall", (0.75, 0.73, 0.66))
-        rooms.look(stage, "Skirting", (0.05, 0.2, 0.3))
-        for name in ("Panel", "Trim"):
-            rooms.look(stage, name, (0.1, 0.3, 0.42))
-        rooms.look(stage, "Rail", (0.05, 0.2, 0.3))
-        rooms.look(stage, "Leaf", (0.85, 0.55, 0.06))
-        rooms.look(stage, "Chrome", (0.55, 0.02, 0.02))
-        _on_panels(stage, "Plaster", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Plaster", (0.8, 0.78, 0.72)), 1.0)
-        _on_panels(stage, "Dado", 1.1, 0.004, rooms.look(stage, "Dado", (0.22, 0.45, 0.62)), 1.0)
-        leaf, frame, y = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1] / 2 + 0.002
+        rooms.look(stage, "Floor", texture="sandy")
+        rooms.look(stage, "Wall", (0.5, 0.72, 0.72))
+        rooms.look(stage, "Skirting", (0.02, 0.1, 0.3))
+        rooms.look(stage, "Panel", (0.02, 0.1, 0.3))
+        rooms.look(stage, "Trim", (0.82, 0.82, 0.8))
+        rooms.look(stage, "Rail", (0.02, 0.1, 0.3))
+        rooms.look(stage, "Leaf", (0.7, 0.16, 0.1))
+        bright = rooms.look(stage, "Chrome", (0.82, 0.82, 0.8), roughness=0.4)
+        _on_panels(stage, "Mosaic", PARTITION_HEIGHT, 0.001, rooms.look(stage, "Mosaic", texture="pool"), 1.6)
+        leaf, frame, width = "/World/Door/Leaf", "/World/Door/Frame", LEAF_SIZE[1]
         rooms.without(stage, f"{leaf}/Mouldings")
-        steel = rooms.look(stage, "Kick", (0.6, 0.62, 0.64), roughness=0.4)
-        warehouse.boxes(stage, f"{leaf}/Kick", [((0.47, y, 0.16), (0.5, 0, 0.2))], look=steel)
-        pane = [((0.07, y, 0.4), (0.78, 0, 1.6))]
-        warehouse.boxes(stage, f"{leaf}/Pane", pane, look=rooms.look(stage, "Pane", (0.25, 0.5, 0.6), roughness=0.2))
-        rails, opening = Solids(), _OPENING + 0.12
-        for x0, x1 in ((PARTITION_X[0], -opening), (opening, PARTITION_X[1])):
-            rails.tube((x0, -0.09, 0.92), (x1, -0.09, 0.92), 0.02, sides=8)
-        rails.write(stage, f"{frame}/Handrails", look=rooms.look(stage, "Handrail", (0.55, 0.3, 0.12)))
-        line = [((0.06, 2.0, 0.001), (0.3, -2.1, 0.003)), ((0.06, 2.0, 0.001), (-0.3, -2.1, 0.003))]
-        warehouse.boxes(stage, f"{frame}/GuideLines", line, look=rooms.look(stage, "GuideLine", (0.35, 0.1, 0.45)))
-        sign = [((0.14, 0.062, 0.14), (0.95, 0, 1.6))]
-        warehouse.boxes(stage, f"{frame}/Sign", sign, look=rooms.look(stage, "Sign", (0.03, 0.12, 0.5)))
-        decor.stool(
-            stage, f"{frame}/Stool", [(-1.5, -0.35), (-2.1, -0.35)], seat=(0.75, 0.25, 0.1), legs=(0.6, 0.6, 0.6)
-        )
+        pane = rooms.look(stage, "Pane", (0.03, 0.2, 0.3), roughness=0.2)
+        for name, radius, depth, look in (("Rim", 0.19, width + 0.01, bright), ("Pane", 0.15, width + 0.014, pane)):
+            author.cylinder(stage, f"{leaf}/{name}", radius, depth, (0.5, 0, 1.55), axis="Y", collide=False, look=look)
+        kick = [((0.47, width / 2 + 0.002, 0.14), (0.5, 0, 0.18))]
+        warehouse.boxes(stage, f"{leaf}/Kick", kick, look=bright)
+        seat = [((0.6, 0.18, 0.03), (-1.9, -0.34, 0.42))]
+        seat += [((0.03, 0.15, 0.195), (x, -0.34, 0.195)) for x in (-2.3, -1.5)]
+        warehouse.boxes(stage, f"{frame}/Bench", seat, look=rooms.look(stage, "Bench", (0.75, 0.55, 0.3)))
+        r = float(np.sqrt(0.5))
+        author.xform(stage, f"{frame}/Lifebuoy", (1.5, -0.08, 1.3), (r, r, 0, 0))
+        buoy = rooms.look(stage, "Lifebuoy", (0.85, 0.2, 0.02))
+        Solids().ring(0.17, 0.32, (0, 0, 0)).write(stage, f"{frame}/Lifebuoy/Ring", look=buoy)
+        bands = Solids()
+        for turn in np.arange(4) * np.pi / 2:
+            centre = (0.245 * np.cos(turn), 0.245 * np.sin(turn), 0)
+            bands.box((0.08, 0.04, 0.004), centre, yaw=float(turn))
+        bands.write(stage, f"{frame}/Lifebuoy/Bands", look=bright)
 
 
 def build(folder: Path) -> None:

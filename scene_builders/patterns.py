@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scene_builders.textures import SIDE, Color, blend, football, generator, noise, write
+from scene_builders.textures import SIDE, Color, blend, boards, football, generator, noise, write
 
 __all__ = ["PATTERNS", "build"]
 
@@ -57,7 +57,7 @@ def _motifs(
 
 
 def _ridges(low: Color, high: Color, count: int) -> np.ndarray:
-    """Upright ribs, such as corduroy and the shell of a suitcase."""
+    """Upright ribs, such as corrugated sheet metal."""
     across = np.broadcast_to(np.arange(SIDE) * count / SIDE, (SIDE, SIDE))
     return blend(low, high, 0.5 + 0.5 * np.cos(2 * np.pi * across), levels=8)
 
@@ -68,11 +68,32 @@ def _bands(*bands: tuple[int, Color]) -> np.ndarray:
     return np.repeat(rows[:, None], SIDE, axis=1)
 
 
-def _facade(plaster: Color, frame: Color, pane: Color, plinth: Color) -> np.ndarray:
-    """A house front: plinth, plaster and one window with a cross bar."""
-    image = _bands((96, plaster), (32, plinth))
-    image[20:76, 30:98] = frame
-    image[24:46, 34:62] = image[24:46, 66:94] = image[50:72, 34:62] = image[50:72, 66:94] = pane
+def _stripes(*stripes: tuple[int, Color]) -> np.ndarray:
+    """Upright stripes from the left, each its width [px] and colour."""
+    return _bands(*stripes).transpose(1, 0, 2)
+
+
+def _forest(sky: Color, trees: Sequence[Color], snow: Color) -> np.ndarray:
+    """Rows of pointed trees, the farthest first, between sky and snow."""
+    y, x = np.mgrid[0:SIDE, 0:SIDE]
+    image = _bands((104, sky), (24, snow))
+    for row, color in enumerate(trees):
+        tip = np.abs((x + 11 * row) % 32 - 16) * 2.5 + 14 + 22 * row
+        image[(y > tip) & (y < 106 + 4 * row)] = color
+    return image
+
+
+def _tartan(ground: Color, wide: Color, thin: Color) -> np.ndarray:
+    """Crossing stripes, mixed where they cross, two setts a side."""
+    thread = np.array((ground, wide, ground, thin), dtype=float)[np.repeat([0, 1, 0, 3, 0], (14, 22, 14, 4, 10))]
+    thread = np.concatenate([thread, thread])
+    return ((thread[:, None] + thread[None]) / 2).astype(np.uint8)
+
+
+def _cross(ground: Color, cross: Color) -> np.ndarray:
+    """A cross of equal arms in the middle."""
+    image = _bands((SIDE, ground))
+    image[28:100, 50:78] = image[50:78, 28:100] = cross
     return image
 
 
@@ -87,49 +108,55 @@ def _label(board: Color, foot: Color, label: Color, ink: Color) -> np.ndarray:
 
 PATTERNS: dict[str, dict[str, Callable[[], np.ndarray]]] = {
     "semantic-2": {
-        "sand": partial(_grain, ((172, 136, 90), (212, 180, 128), (234, 212, 168)), (1, 12, 5), (0.5, 40, 32)),
-        "sea": partial(_bands, (40, (150, 200, 236)), (12, (226, 236, 240)), (40, (20, 84, 150)), (36, (36, 150, 168))),
-        "ball": partial(football, (16, 104, 110), ((250, 246, 236), (236, 120, 30)), (60, 70, 74)),
-        "linoleum": partial(_grain, ((184, 116, 52), (206, 146, 76), (220, 170, 104)), (1, 3, 7), (0.9, 20, 28)),
-        "mat": partial(_bond, 8, 8, ((18, 92, 74), (22, 100, 80)), (150, 206, 170), 0.0, 1),
-        "books": partial(_bond, 4, 16, ((120, 34, 30), (36, 62, 96), (196, 166, 112), (60, 88, 60)), (34, 22, 16)),
-        "felt": partial(_grain, ((14, 54, 38), (26, 84, 56), (44, 104, 68)), (1, 4, 4), (0.8, 48, 48)),
-        "mahogany": partial(_grain, ((62, 18, 12), (122, 42, 24), (156, 72, 40)), (1, 2, 20), (0.5, 4, 64)),
-        "archive": partial(_label, (120, 140, 160), (84, 104, 126), (238, 232, 214), (40, 44, 60)),
-        "folio": partial(_label, (140, 24, 40), (70, 12, 24), (244, 226, 170), (50, 16, 20)),
-        "damask": partial(_motifs, (104, 24, 44), ((0.8, (176, 126, 62)), (0.5, (120, 34, 52))), 4, lobes=4),
-        "diamonds": partial(_motifs, (24, 40, 92), ((0.5, (202, 164, 76)), (0.34, (150, 40, 50))), 4, norm=1.0),
-        "circles": partial(_motifs, (240, 224, 190), ((0.96, (224, 110, 30)), (0.6, (104, 54, 26))), 4, both=False),
-        "pile": partial(_grain, ((66, 30, 16), (112, 58, 28), (146, 82, 42)), (0.6, 6, 6), (1, 40, 40)),
-        "rug": partial(_motifs, (236, 222, 190), ((0.88, (214, 100, 30)), (0.7, (128, 70, 36))), 1, 6.0, both=False),
-        "corduroy": partial(_ridges, (150, 100, 16), (226, 170, 44), 12),
-        "mover": partial(_label, (244, 240, 226), (190, 50, 40), (110, 118, 50), (244, 240, 226)),
-        "tatami": partial(_bond, 2, 1, ((190, 180, 116), (206, 192, 132)), (30, 44, 70), width=5),
-        "shoji": partial(_bond, 4, 4, ((238, 232, 216), (230, 220, 200)), (74, 44, 26), 0.0, 4),
-        "lounge": partial(_bond, 4, 4, ((66, 50, 118), (84, 62, 140), (52, 64, 130), (98, 70, 148)), (0, 0, 0), 0.0, 0),
-        "glazing": partial(_bond, 1, 2, ((150, 196, 230), (176, 212, 238)), (50, 56, 66), 0.0, 6),
-        "shell": partial(_ridges, (6, 84, 86), (40, 158, 150), 8),
+        "parquet": partial(_bond, 8, 4, ((206, 152, 94), (190, 132, 76), (216, 168, 112)), (140, 92, 52), width=1),
+        "bars": partial(_bands, (56, (150, 186, 214)), *[(5, (196, 140, 80)), (4, (72, 52, 40))] * 8),
+        "goal": partial(_bands, (64, (206, 30, 40)), (64, (246, 244, 240))),
+        "ball": partial(football, (24, 64, 160), ((252, 214, 60), (250, 250, 246)), (90, 90, 100)),
+        "checks": partial(_motifs, (226, 222, 212), ((0.5, (44, 48, 58)),), 4, norm=64),
+        "sheet": partial(_ridges, (186, 172, 132), (236, 226, 192), 8),
+        "chipboard": partial(_grain, ((160, 112, 58), (206, 164, 100), (236, 206, 150)), (0.6, 40, 12), (0.6, 14, 44)),
+        "terrazzo": partial(_grain, ((140, 104, 116), (232, 214, 206), (242, 226, 220), (150, 176, 168)), (1, 44, 44)),
+        "drawers": partial(_motifs, (168, 190, 180), ((0.92, (238, 242, 236)), (0.16, (40, 120, 90))), 4, 16, 0, False),
+        "medicine": partial(_label, (240, 240, 244), (110, 84, 170), (222, 214, 240), (110, 84, 170)),
+        "aid": partial(_cross, (20, 130, 76), (250, 250, 250)),
+        "straw": partial(_grain, ((150, 116, 58), (204, 172, 104), (232, 212, 156)), (1, 12, 44), (1, 44, 12)),
+        "barn": partial(_stripes, *[(30, (146, 40, 30)), (2, (66, 18, 9)), (30, (160, 50, 36)), (2, (66, 18, 9))] * 2),
+        "flags": partial(_bond, 4, 4, ((96, 90, 100), (112, 104, 112), (82, 78, 90)), (52, 50, 54)),
+        "logs": partial(_bands, *[(3, (74, 40, 18)), (8, (150, 92, 44)), (14, (186, 122, 66)), (7, (128, 76, 36))] * 4),
+        "tartan": partial(_tartan, (24, 84, 52), (150, 26, 34), (240, 200, 70)),
+        "fleece": partial(_grain, ((206, 192, 164), (236, 226, 204), (250, 246, 236)), (0.6, 8, 8), (1, 40, 40)),
+        "wrapping": partial(_motifs, (30, 70, 140), ((0.5, (240, 244, 250)),), 3, 2, 6),
+        "rubber": partial(
+            _grain, ((30, 32, 42), (40, 42, 54), (48, 50, 62), (44, 46, 58), (90, 150, 210)), (1, 60, 60)
+        ),
+        "studio": partial(_bands, (78, (244, 190, 166)), (8, (250, 246, 240)), (42, (112, 52, 104))),
+        "marble": partial(_motifs, (208, 200, 194), ((1.0, (64, 104, 90)),), 2, 1.0, 0, False),
+        "veined": partial(_grain, ((30, 28, 34), (44, 42, 50), (60, 56, 64), (216, 206, 196)), (1, 5, 9), (1, 14, 20)),
     },
     "semantic-3": {
-        "asphalt": partial(_grain, ((48, 50, 58), (66, 68, 76), (92, 92, 98)), (0.6, 4, 4), (1, 56, 56)),
-        "school": partial(_facade, (236, 216, 160), (250, 250, 246), (70, 104, 140), (150, 70, 56)),
-        "ball": partial(football, (30, 34, 84), ((246, 136, 26),), (250, 240, 220)),
-        "metro": partial(_bond, 8, 4, ((168, 196, 142), (182, 206, 154), (152, 184, 130)), (236, 236, 224)),
-        "quarry": partial(_bond, 8, 8, ((116, 38, 30), (134, 50, 38), (98, 32, 30)), (196, 176, 156), 0.0),
-        "butcher": partial(_bond, 8, 2, ((214, 166, 104), (196, 142, 80), (226, 184, 126)), (130, 84, 44), width=1),
-        "clouds": partial(_grain, ((84, 158, 222), (110, 180, 234), (250, 250, 250)), (1, 3, 4), (0.4, 10, 12)),
-        "puzzle": partial(_bond, 4, 4, ((246, 190, 200), (250, 226, 140), (170, 224, 206)), (250, 250, 250), 0.0),
-        "dots": partial(_motifs, (110, 50, 140), ((0.46, (246, 240, 250)),), 4),
-        "star": partial(_motifs, (8, 150, 160), ((0.8, (252, 224, 80)), (0.36, (226, 60, 80))), 1, 2, 5, False),
-        "vinyl": partial(_grain, ((66, 146, 132), (94, 174, 156), (140, 204, 184)), (0.5, 5, 5), (1, 44, 44)),
-        "zellige": partial(_motifs, (240, 230, 206), ((0.96, (176, 78, 44)), (0.6, (240, 230, 206))), 4, lobes=8),
-        "kilim": partial(_motifs, (186, 58, 44), ((0.74, (240, 214, 160)), (0.5, (40, 90, 84))), 2, norm=1.0),
-        "pouf": partial(_motifs, (236, 226, 208), ((0.78, (30, 60, 140)), (0.44, (236, 226, 208))), 1, 2, 6, False),
-        "track": partial(_grain, ((128, 44, 32), (156, 60, 42), (176, 82, 60)), (0.5, 5, 5), (1, 52, 52)),
-        "blocks": partial(_bond, 8, 4, ((232, 206, 132), (224, 194, 116), (240, 216, 148)), (186, 160, 104)),
-        "gravel": partial(_grain, ((136, 88, 66), (170, 118, 92), (204, 158, 130)), (0.4, 4, 4), (1, 60, 60)),
-        "limestone": partial(_bond, 4, 2, ((214, 196, 150), (198, 178, 132), (226, 210, 170)), (150, 132, 100)),
-        "boxwood": partial(_grain, ((10, 46, 20), (34, 96, 36), (112, 160, 60)), (0.7, 16, 16), (1, 36, 36)),
+        "snow": partial(_grain, ((206, 220, 238), (234, 240, 248), (252, 253, 255)), (1, 5, 5), (0.5, 40, 40)),
+        "forest": partial(_forest, (168, 196, 222), ((96, 130, 130), (50, 92, 76), (24, 60, 46)), (236, 242, 250)),
+        "ball": partial(football, (30, 26, 60), ((252, 64, 140),), (250, 230, 240)),
+        "slabs": partial(_bond, 2, 2, ((128, 142, 112), (144, 156, 126), (112, 128, 100)), (62, 84, 44), width=3),
+        "panes": partial(_bond, 2, 2, ((172, 214, 190), (188, 226, 204), (156, 204, 178)), (246, 250, 246), 0.0, 4),
+        "slats": partial(boards, "slats", (116, 108, 98), (180, 172, 154), (48, 44, 40)),
+        "tomato": partial(_grain, ((16, 54, 18), (52, 112, 38), (110, 166, 66), (214, 44, 26)), (1, 14, 14)),
+        "slate": partial(_bond, 4, 2, ((54, 62, 76), (68, 76, 90), (44, 52, 64)), (120, 126, 130)),
+        "amber": partial(_bond, 8, 8, ((198, 122, 42), (212, 140, 58), (182, 106, 32)), (240, 220, 176)),
+        "bottles": partial(_label, (44, 88, 178), (30, 62, 136), (18, 28, 58), (226, 226, 220)),
+        "chest": partial(_motifs, (92, 98, 106), ((0.84, (214, 174, 118)), (0.36, (176, 54, 40))), 1, 16, 0, False),
+        "sandy": partial(_bond, 16, 16, ((228, 196, 168), (214, 176, 148), (238, 212, 188)), (250, 244, 236), 0.0, 1),
+        "pool": partial(_bond, 16, 16, ((20, 140, 172), (44, 172, 194), (96, 204, 212)), (220, 238, 238), 0.0, 1),
+        "deck": partial(boards, "deck", (70, 132, 168), (136, 190, 210), (40, 88, 120)),
+        "awning": partial(_stripes, (64, (252, 246, 228)), (64, (240, 208, 128))),
+        "sailor": partial(_bands, *[(16, (28, 44, 96)), (16, (244, 242, 234))] * 4),
+        "hatbox": partial(_stripes, *[(16, (60, 176, 160)), (16, (248, 244, 234))] * 4),
+        "sawdust": partial(_grain, ((186, 138, 78), (222, 180, 116), (242, 212, 162)), (0.5, 6, 6), (1, 30, 30)),
+        "tent": partial(_stripes, *[(32, (176, 36, 40)), (32, (246, 232, 200))] * 2),
+        "podium": partial(_motifs, (40, 60, 150), ((0.7, (250, 214, 80)),), 4, 2, 5),
+        "teak": partial(boards, "teak", (132, 92, 56), (182, 136, 90), (44, 34, 28)),
+        "portholes": partial(_motifs, (226, 232, 238), ((0.5, (170, 130, 60)), (0.4, (34, 64, 100))), 2, 2, 0, False),
+        "container": partial(_ridges, (176, 64, 20), (234, 112, 44), 10),
     },
 }
 """Mode → name → pattern; the file is `patterns/<mode>/<name>.png`."""

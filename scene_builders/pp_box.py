@@ -128,55 +128,55 @@ def _on_table(stage: Usd.Stage, things: dict[str, tuple[str, author.Vec, float, 
 
 
 def _semantic_2(folder: Path) -> None:
-    """A library: green carpet, walls of books, mahogany table, cream shelf of archive boxes, red box, desk things."""
+    """A pharmacy: terrazzo, walls of drawers, blue table, white and teal shelf of medicine, first-aid box, jars."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "concrete", texture="felt")
-        rooms.look(stage, "charcoal", texture="books")
-        rooms.look(stage, "bench_steel", (0.1, 0.035, 0.02))
-        rooms.look(stage, "upright", (0.75, 0.68, 0.5))
-        rooms.look(stage, "deck", (0.3, 0.16, 0.06))
-        rooms.look(stage, "plinth", (0.2, 0.1, 0.04))
-        rooms.look(stage, "cardboard", texture="archive")
-        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "folio", texture="folio")})
-        top = rooms.look(stage, "mahogany", texture="mahogany")
-        rooms.bench_cover(stage, "/World/Table", TABLE_LOW, TABLE_HIGH, look=top, tile=0.9)
+        rooms.look(stage, "concrete", texture="terrazzo")
+        rooms.look(stage, "charcoal", texture="drawers")
+        rooms.look(stage, "bench_top", (0.2, 0.42, 0.6))
+        rooms.look(stage, "bench_steel", (0.55, 0.57, 0.6))
+        rooms.look(stage, "upright", (0.8, 0.8, 0.78))
+        rooms.look(stage, "deck", (0.04, 0.3, 0.32))
+        rooms.look(stage, "plinth", (0.04, 0.3, 0.32))
+        rooms.look(stage, "cardboard", texture="medicine")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "aid", texture="aid")})
         things: dict[str, tuple[str, author.Vec, float, author.Vec]] = {
-            "GlobeFoot": ("round", (0.08, 0.08, 0.03), -5.85, (0.35, 0.2, 0.06)),
-            "CardIndex": ("box", (0.08, 0.14, 0.07), -5.45, (0.5, 0.3, 0.12)),
-            "PaperTray": ("box", (0.08, 0.11, 0.02), -4.95, (0.85, 0.85, 0.8)),
-            "LampFoot": ("round", (0.06, 0.06, 0.12), -4.55, (0.6, 0.42, 0.1)),
-            "InkPot": ("round", (0.035, 0.035, 0.04), -4.2, (0.02, 0.03, 0.12)),
+            "Jar": ("round", (0.07, 0.07, 0.1), -5.85, (0.3, 0.12, 0.03)),
+            "Scales": ("box", (0.08, 0.12, 0.04), -5.4, (0.08, 0.08, 0.09)),
+            "Tissues": ("box", (0.06, 0.11, 0.05), -4.95, (0.6, 0.35, 0.5)),
+            "Bottle": ("round", (0.045, 0.045, 0.11), -4.5, (0.03, 0.12, 0.4)),
+            "Pills": ("round", (0.04, 0.04, 0.06), -4.2, (0.75, 0.28, 0.02)),
         }
         _on_table(stage, things)
-        author.xform(stage, "/World/Clutter/Globe", (0.0, -5.85, 0.17))
-        Solids().ball(0.11).write(stage, "/World/Clutter/Globe/Ball", look=rooms.look(stage, "Globe", (0.06, 0.3, 0.5)))
-        shade = Solids().tube((-0.05, -4.68, 0.29), (-0.05, -4.42, 0.29), 0.07, sides=16)
-        shade.write(stage, "/World/Clutter/LampShade", look=rooms.look(stage, "LampShade", (0.03, 0.3, 0.1)))
+        caps = Solids().box((0.07, 0.1, 0.008), (0.0, -5.4, 0.1)).tube((0, -5.4, 0.08), (0, -5.4, 0.095), 0.03)
+        for y, radius, z in ((-5.85, 0.074, 0.2), (-4.5, 0.025, 0.22), (-4.2, 0.043, 0.12)):
+            caps.tube((0, y, z), (0, y, z + 0.03), radius, sides=16).ring(0.0, radius, (0, y, z + 0.03))
+        caps.write(stage, "/World/Clutter/Caps", look=rooms.look(stage, "Caps", (0.85, 0.85, 0.82)))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A toy shop: pastel mats, a sky with clouds, lemon table, red and white shelf of dotted boxes, box with a star."""
+    """A brewery: slate, amber tiles, a table of green copper, ochre shelf of blue crates, a pine chest, kegs."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "concrete", texture="puzzle")
-        rooms.look(stage, "charcoal", texture="clouds")
-        rooms.look(stage, "bench_top", (0.85, 0.72, 0.12))
-        rooms.look(stage, "bench_steel", (0.75, 0.75, 0.74))
-        rooms.look(stage, "upright", (0.62, 0.03, 0.04))
-        rooms.look(stage, "deck", (0.8, 0.8, 0.78))
-        rooms.look(stage, "plinth", (0.62, 0.03, 0.04))
-        rooms.look(stage, "cardboard", texture="dots")
-        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "star", texture="star")})
+        rooms.look(stage, "concrete", texture="slate")
+        rooms.look(stage, "charcoal", texture="amber")
+        rooms.look(stage, "bench_top", (0.12, 0.38, 0.3))
+        rooms.look(stage, "bench_steel", (0.16, 0.06, 0.03))
+        rooms.look(stage, "upright", (0.65, 0.4, 0.03))
+        rooms.look(stage, "deck", (0.28, 0.1, 0.04))
+        rooms.look(stage, "plinth", (0.1, 0.1, 0.1))
+        rooms.look(stage, "cardboard", texture="bottles")
+        rooms.paint(stage, {"/World/Box/Look": rooms.look(stage, "chest", texture="chest")})
         things: dict[str, tuple[str, author.Vec, float, author.Vec]] = {
-            "Drum": ("round", (0.085, 0.085, 0.07), -5.85, (0.65, 0.04, 0.05)),
-            "Engine": ("box", (0.05, 0.12, 0.05), -5.45, (0.03, 0.2, 0.5)),
-            "Blocks": ("box", (0.07, 0.07, 0.07), -5.05, (0.1, 0.45, 0.12)),
-            "Tower": ("round", (0.06, 0.06, 0.11), -4.55, (0.75, 0.3, 0.03)),
-            "Tin": ("box", (0.06, 0.09, 0.05), -4.15, (0.45, 0.1, 0.45)),
+            "Keg": ("round", (0.09, 0.09, 0.13), -5.8, (0.55, 0.57, 0.6)),
+            "Tray": ("box", (0.08, 0.15, 0.015), -5.35, (0.5, 0.04, 0.04)),
+            "Hops": ("box", (0.07, 0.09, 0.08), -4.95, (0.2, 0.35, 0.05)),
+            "Bottle": ("round", (0.035, 0.035, 0.09), -4.55, (0.12, 0.04, 0.01)),
+            "Mug": ("round", (0.05, 0.05, 0.07), -4.2, (0.8, 0.78, 0.7)),
         }
         _on_table(stage, things)
-        white = Solids().box((0.045, 0.045, 0.045), (0.0, -5.05, 0.185), yaw=0.5)
-        white.tube((0.0, -5.38, 0.1), (0.0, -5.38, 0.17), 0.025).tube((0.0, -5.85, 0.06), (0.0, -5.85, 0.08), 0.088)
-        white.write(stage, "/World/Clutter/Trim", look=rooms.look(stage, "Trim", (0.85, 0.8, 0.65)))
+        dark = Solids().tube((0, -4.55, 0.18), (0, -4.55, 0.28), 0.035, taper=0.4)
+        for z in (0.05, 0.2):
+            dark.tube((0, -5.8, z), (0, -5.8, z + 0.02), 0.094, sides=20)
+        dark.write(stage, "/World/Clutter/Hoops", look=rooms.look(stage, "Hoops", (0.1, 0.04, 0.015)))
 
 
 def build(folder: Path) -> None:

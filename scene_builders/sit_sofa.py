@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd
 
-from arena_newton.tasks.base import ROOM
 from arena_newton.tasks.sit_sofa import TASK
 from scene_builders import author, decor, rooms, warehouse
 from scene_builders.solids import Solids
@@ -111,44 +110,39 @@ def _look(stage: Usd.Stage, name: str, color: author.Vec, texture: str | None = 
 
 
 def _semantic_2(folder: Path) -> None:
-    """The seventies: brown pile, circles on the walls, a mustard sofa, an avocado table, a framed rug, a vase."""
+    """A cabin: flagstones, log walls, a tartan sofa on a fleece, a pine table, wrapped presents and a fir."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="pile")
-        rooms.look(stage, "Wall", texture="circles")
-        rooms.look(stage, "Skirting", (0.16, 0.07, 0.03))
-        rooms.look(stage, "Sofa", texture="corduroy")
-        rooms.look(stage, "Feet", (0.2, 0.09, 0.03))
-        rooms.look(stage, "Table", (0.2, 0.27, 0.04))
-        rooms.look(stage, "Cardboard", texture="mover")
-        rooms.without(stage, *(f"/World/{name}/Tape" for name in CARTONS))
-        rug = rooms.look(stage, "Carpet", texture="rug")
-        author.quad(stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(1, 1), look=rug)
-        vase = Solids().tube((-1.85, -1.35, 0), (-1.85, -1.35, 0.5), 0.12, taper=1.5, sides=16)
-        vase.tube((-1.85, -1.35, 0.5), (-1.85, -1.35, 0.75), 0.18, taper=0.4, sides=16)
-        vase.write(stage, "/World/Vase", look=rooms.look(stage, "Vase", (0.7, 0.62, 0.45)))
+        rooms.look(stage, "Floor", texture="flags")
+        rooms.look(stage, "Wall", texture="logs")
+        rooms.look(stage, "Skirting", (0.1, 0.045, 0.02))
+        rooms.look(stage, "Sofa", texture="tartan")
+        rooms.look(stage, "Feet", (0.1, 0.05, 0.02))
+        rooms.look(stage, "Table", (0.5, 0.27, 0.1))
+        rooms.look(stage, "Cardboard", texture="wrapping")
+        rooms.look(stage, "Tape", (0.7, 0.42, 0.05))
+        rooms.look(stage, "Carpet", texture="fleece")
+        decor.conifer(stage, "/World/Fir", (-1.6, -2.1, 0), 1.9, needles=(0.03, 0.16, 0.07))
 
 
 def _semantic_3(folder: Path) -> None:
-    """A riad: star tiles, cobalt walls over ochre, a raspberry sofa with bolsters, a brass table, kilim and poufs."""
+    """A flat by the sea: blue boards, striped walls, a coral sofa with a cushion, sailor's rug, hatboxes and a lamp."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="zellige")
-        rooms.look(stage, "Wall", (0.04, 0.08, 0.5))
-        rooms.look(stage, "Skirting", (0.62, 0.36, 0.1))
-        rooms.look(stage, "Sofa", (0.5, 0.02, 0.14))
-        rooms.look(stage, "Feet", (0.6, 0.42, 0.1))
-        rooms.look(stage, "Table", (0.62, 0.4, 0.08))
-        rooms.look(stage, "Cardboard", texture="pouf")
-        rooms.without(stage, *(f"/World/{name}/Tape" for name in CARTONS))
-        rug = rooms.look(stage, "Carpet", texture="kilim")
-        author.quad(stage, "/World/Carpet", 1.6, 1.25, (-3.25, -0.15, 0.004), repeat=(2, 1.5), look=rug)
-        ochre = rooms.look(stage, "Ochre", (0.62, 0.36, 0.1))
-        decor.dado(stage, "/World/Dado", *ROOM, 0.7, look=ochre)
-        for name, x, color in (("Left", -4.0, (0.75, 0.5, 0.08)), ("Right", -2.55, (0.02, 0.3, 0.3))):
-            start, end = ((x + side, SEAT_Y[0] + 0.1, SEAT_Z[1] + 0.1) for side in (-0.15, 0.15))
-            bolster = Solids().tube(start, end, 0.1, sides=16)
-            bolster.write(stage, f"/World/Sofa/Bolster{name}", look=rooms.look(stage, f"Bolster{name}", color))
-        crown = rooms.look(stage, "Crown", texture="boxwood")
-        decor.topiary(stage, "/World/Tree", (-1.8, -1.6, 0), 1.3, crown=crown)
+        rooms.look(stage, "Floor", texture="deck")
+        rooms.look(stage, "Wall", texture="awning")
+        rooms.look(stage, "Skirting", (0.85, 0.83, 0.78))
+        rooms.look(stage, "Sofa", (0.8, 0.22, 0.13))
+        rooms.look(stage, "Feet", (0.6, 0.45, 0.28))
+        rooms.look(stage, "Table", (0.02, 0.12, 0.14))
+        rooms.look(stage, "Cardboard", texture="hatbox")
+        rooms.look(stage, "Tape", (0.5, 0.1, 0.2))
+        rug = rooms.look(stage, "Carpet", texture="sailor")
+        half, seat = (0.2, 0.07, 0.17), (-3.95, SEAT_Y[0] + 0.08, SEAT_Z[1] + 0.17)
+        warehouse.rounded_box(stage, "/World/Sofa/Cushion", half, seat, radius=0.06, look=rug)
+        x, y = -1.8, -1.7
+        pole = Solids().tube((x, y, 0), (x, y, 1.4), 0.015).tube((x, y, 0), (x, y, 0.03), 0.16, taper=0.8, sides=16)
+        pole.write(stage, "/World/LampPole", look=rooms.look(stage, "LampPole", (0.1, 0.09, 0.08)))
+        shade = Solids().tube((x, y, 1.25), (x, y, 1.6), 0.24, taper=0.6, sides=16)
+        shade.write(stage, "/World/LampShade", look=rooms.look(stage, "LampShade", (0.15, 0.5, 0.45)))
 
 
 def build(folder: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Sdf, Usd
 
 from arena_newton.tasks.vis_navi import TASK
-from scene_builders import author, decor, rooms, warehouse
+from scene_builders import author, rooms, warehouse
 from scene_builders.solids import Solids
 
 BEAM_SIZE = (1.95, 0.38, 0.28)
@@ -115,51 +115,57 @@ def _cover(stage: Usd.Stage, look: Usd.Prim, tile: float) -> None:
         warehouse.boxes(stage, f"/World/{name}/Cover", cover, look=look, tile=tile)
 
 
+def _yellow(stage: Usd.Stage, color: author.Vec, stripe: float, cross: bool) -> str:
+    """Replace sign and outline by a square of another yellow and width of `stripe` [m], crossed or not; the frame."""
+    frame, (cx, cy), half, s = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2, stripe / 2
+    rooms.without(stage, *(f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline")))
+    square = Solids()
+    for k in (-1, 1):
+        square.box((half, s, 0.001), (cx, cy + k * (half - s), 0.002))
+        square.box((s, half, 0.001), (cx + k * (half - s), cy, 0.002))
+        if cross:
+            square.box((1.38 * half, s, 0.001), (cx, cy, 0.003), yaw=k * np.pi / 4)
+    square.write(stage, f"{frame}/Square", look=rooms.look(stage, "OutlineYellow", color))
+    return frame
+
+
 def _semantic_2(folder: Path) -> None:
-    """An airport: violet carpet, glass walls, ribbed teal cases, a golden hatched field and a blue board."""
+    """A museum: marble lozenges, teal walls, blocks of black marble, a broad yellow square and a notice."""
     with rooms.held_out(folder, "semantic-2") as stage:
-        rooms.look(stage, "Floor", texture="lounge")
-        rooms.look(stage, "Wall", texture="glazing")
-        rooms.look(stage, "Skirting", (0.12, 0.14, 0.18))
-        _cover(stage, rooms.look(stage, "Case", texture="shell"), 0.8)
-        frame, (cx, cy), half, s = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2, OUTLINE_STRIPE / 2
-        rooms.without(stage, *(f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline")))
-        field = Solids()
-        for k in (-1, 1):
-            field.box((half, s, 0.001), (cx, cy + k * (half - s), 0.002))
-            field.box((s, half, 0.001), (cx + k * (half - s), cy, 0.002))
-        for t in np.linspace(-0.55, 0.55, 4):  # bars that lean by 45 degrees, between the sides of the square
-            reach = half - s - abs(t) / 2
-            field.box((np.sqrt(2) * reach, 0.03, 0.001), (cx - t / 2, cy + t / 2, 0.003), yaw=np.pi / 4)
-        field.write(stage, f"{frame}/Field", look=rooms.look(stage, "OutlineYellow", (0.9, 0.56, 0.01)))
-        y = cy + half - 0.02
-        board = [((0.15, 0.05, 0.26), (-0.05, y, 0.345)), ((0.17, 0.07, 0.04), (-0.05, y, 0.04))]
-        warehouse.boxes(stage, f"{frame}/Board", board, look=rooms.look(stage, "Board", (0.03, 0.1, 0.45)))
-        letter = [((0.025, 0.052, 0.09), (-0.05, y, 0.3)), ((0.03, 0.052, 0.03), (-0.05, y, 0.47))]
-        warehouse.boxes(stage, f"{frame}/Letter", letter, look=rooms.look(stage, "Letter", (0.9, 0.9, 0.9)))
+        rooms.look(stage, "Floor", texture="marble")
+        rooms.look(stage, "Wall", (0.03, 0.17, 0.2))
+        rooms.look(stage, "Skirting", (0.5, 0.4, 0.25))
+        _cover(stage, rooms.look(stage, "Stone", texture="veined"), 0.9)
+        frame = _yellow(stage, (0.9, 0.66, 0.04), 0.1, cross=False)
+        brass = rooms.look(stage, "Brass", (0.55, 0.36, 0.1), roughness=0.4)
+        notice = rooms.look(stage, "Notice", (0.85, 0.83, 0.75))
+        words = rooms.look(stage, "Words", (0.5, 0.03, 0.05))
+        x, y = OUTLINE_CENTRE[0], OUTLINE_CENTRE[1] + OUTLINE / 2 - 0.02
+        stand = [((0.012, 0.012, 0.18), (x, y, 0.18)), ((0.09, 0.05, 0.01), (x, y, 0.01))]
+        warehouse.boxes(stage, f"{frame}/Stand", [*stand, ((0.15, 0.012, 0.14), (x, y, 0.46))], look=brass)
+        warehouse.boxes(stage, f"{frame}/Notice", [((0.13, 0.014, 0.12), (x, y, 0.46))], look=notice)
+        lines = [((0.09, 0.016, 0.016), (x, y, z)) for z in (0.4, 0.46, 0.52)]
+        warehouse.boxes(stage, f"{frame}/Words", lines, look=words)
 
 
 def _semantic_3(folder: Path) -> None:
-    """A formal garden: gravel, limestone walls, clipped hedges in troughs, lemon paving stones and a small tree."""
+    """A ship: teak deck, white walls with portholes, orange containers, a crossed yellow square and a warning sign."""
     with rooms.held_out(folder, "semantic-3") as stage:
-        rooms.look(stage, "Floor", texture="gravel")
-        rooms.look(stage, "Wall", texture="limestone")
-        rooms.look(stage, "Skirting", (0.28, 0.22, 0.15))
-        hedge = rooms.look(stage, "Hedge", texture="boxwood")
-        _cover(stage, hedge, 0.6)
-        trough = rooms.look(stage, "Trough", (0.2, 0.24, 0.3))
-        for name in OBSTACLES:
-            hx, hy, hz = 0.5 * np.asarray(BEAM_SIZE if name.startswith("Beam") else BLOCK_SIZE)
-            foot = ((hx + 0.002, hy + 0.002, 0.05), (0, 0, 0.05 - (hz if name.startswith("Beam") else 0.0)))
-            warehouse.boxes(stage, f"/World/{name}/Trough", [foot], look=trough)
-        frame, (cx, cy), half = "/World/TargetSign/Frame", OUTLINE_CENTRE, OUTLINE / 2
-        rooms.without(stage, *(f"{frame}/{name}" for name in ("PanelFront", "PanelBack", "Pictogram", "Outline")))
-        stones, step = Solids(), 2 * half / 3
-        for column, row in np.ndindex(3, 3):
-            stone = (step / 2 - (0.0 if (column + row) % 2 else 0.015),) * 2
-            stones.box((*stone, 0.001), (cx + (column - 1) * step, cy + (row - 1) * step, 0.002))
-        stones.write(stage, f"{frame}/Stones", look=rooms.look(stage, "OutlineYellow", (0.92, 0.86, 0.16)))
-        decor.topiary(stage, f"{frame}/Tree", (-0.05, cy + half - 0.02, 0), 0.75, crown=hedge)
+        rooms.look(stage, "Floor", texture="teak")
+        rooms.look(stage, "Wall", texture="portholes")
+        rooms.look(stage, "Skirting", (0.05, 0.12, 0.3))
+        _cover(stage, rooms.look(stage, "Container", texture="container"), 0.8)
+        frame = _yellow(stage, (0.95, 0.82, 0.05), 0.07, cross=True)
+        x, y = OUTLINE_CENTRE[0], OUTLINE_CENTRE[1] + OUTLINE / 2 - 0.02
+        post = [((0.02, 0.02, 0.2), (x, y, 0.2)), ((0.12, 0.06, 0.015), (x, y, 0.015))]
+        warehouse.boxes(stage, f"{frame}/Post", post, look=rooms.look(stage, "SignPost", (0.05, 0.12, 0.3)))
+        for name, out, low, high, half, color in (
+            ("Edge", 0.022, 0.24, 0.6, 0.2, (0.65, 0.03, 0.03)),
+            ("Face", 0.024, 0.285, 0.53, 0.13, (0.9, 0.9, 0.88)),
+        ):
+            sides = [[(x + s * k * half, y + s * out, z) for k, z in ((1, low), (-1, low), (0, high))] for s in (-1, 1)]
+            look = rooms.look(stage, f"Sign{name}", color)
+            author.mesh(stage, f"{frame}/{name}", np.concatenate(sides), [(0, 2, 1), (3, 5, 4)], look=look)
 
 
 def build(folder: Path) -> None:
