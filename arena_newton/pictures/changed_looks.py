@@ -104,7 +104,7 @@ class Changes:
     flat: float = 0.0
     """A part of its texture and shading less, of each shape that gets another colour."""
     figures: float = 0.0
-    """Each of four ellipses or boxes with a colour or a pattern of its own, as furniture that no scene of training has."""
+    """Each of four ellipses or boxes with a look of its own, as furniture that no scene of a training has."""
     tones: float = 0.0
     """A pattern in tones of one colour, as of sand or wood, of each shape that gets another look."""
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from made_suites import cell_of, outcomes, write_suite
@@ -42,6 +43,14 @@ def test_the_generalist_plays_every_cell(tmp_path):
     }
     swapped = [cell for cell in cells_of(read_plan("tiny"), "own", tmp_path) if cell.tracker not in cell.trained_on]
     assert {cell.mode for cell in swapped} == {"base"}
+
+
+def test_rows_of_wrists_differ_by_their_cameras(tmp_path):
+    """One row sees through the head camera alone, and the sets of both have all that the other one sees through."""
+    plan = read_plan("wrists")
+    front, wrists = plan.rows
+    assert (front.train.cameras, wrists.train.cameras) == (("front",), plan.record.cameras)
+    assert replace(wrists.train, cameras=("front",)) == front.train and len(plan.record.cameras) == 3
 
 
 def test_rows_of_the_generalist_are_its_ablation():
