@@ -22,6 +22,7 @@ from arena_newton.eval.records.chain import joint_head
 from arena_newton.eval.records.document import CONFIG_FILE, SUITE_FILE
 from arena_newton.eval.records.journal import BY_CONTENT, JOURNAL_FILE
 from arena_newton.eval.reports.wording import media_of
+from arena_newton.eval.suites.suite_records import read_suite
 from arena_newton.eval.tables.episode_table import cells_of
 from arena_newton.files.stored_json import read_regular
 from arena_newton.files.untrusted_files import create, read_arrays, zip_members
@@ -156,10 +157,12 @@ def unpack(path: Path, digest: str, into: Path) -> str | None:
 
 
 def strays(root: Path, runs: Sequence[RunRecord]) -> list[str]:
-    """Files of an unpacked bundle that none of its runs has, by their names in it."""
+    """Files of an unpacked bundle that none of its runs has, by their names in it; of a suite, runs are its cells'."""
     known = {root / SUITE_FILE}
     if (root / SUITE_FILE).is_file():
         known |= set(root.glob("suite.*.jsonl"))
+        cells = {root / cell.folder for cell in read_suite(root).cells}
+        runs = [run for run in runs if run.folder in cells]
     for run in runs:
         media = {path for record in run.records for path in (record.media or {}).values()}
         known |= {run.folder / name for name in (CONFIG_FILE, JOURNAL_FILE, *media)}

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import FakePolicy, factories
 from made_signals import signals
+from made_suites import cell_of, write_suite
 
 from arena_newton.eval.__main__ import main
 from arena_newton.eval.audit import folder_audit
@@ -298,6 +299,30 @@ def test_a_name_may_have_accents_and_pi(entry, capsys):
     fill(entry, name="π0.5, façade (ours)", authors="王涛文, Łukasz Ж.", training="Дома", training_data="none")
     code, said, _ = build(entry, capsys)
     assert code == 0, said
+
+
+def test_runs_that_the_board_does_not_show_are_no_copies(tmp_path, capsys):
+    """Copies of a run and runs beside a suite's cells, which make the draw of a forged one unlikely, are refused."""
+    flags = ["--task", "football", "--engine", "mujoco", "--seeds", "0", "--repeats", "2"]
+    assert main([*flags, "--out", str(tmp_path / "runs" / "shown")], factories()) == 0
+    late = tmp_path / "runs" / "late"
+    assert main([*flags, "--latency-ticks", "10", "--out", str(late)], factories()) == 0
+    cell = dataclasses.replace(
+        cell_of("expert", "expert", "twist2", "football", trained_on=(), tasks_of=()), spec="expert"
+    )
+    suite = write_suite(tmp_path / "suite", [(dataclasses.replace(cell, labels="v4", episodes=2), None)])
+    shutil.copytree(tmp_path / "runs" / "shown", suite / cell.folder)
+    for folder, copy, code, named in (
+        (tmp_path / "runs", tmp_path / "runs" / "again", 1, "ours/bundle.zip: 2 of its runs are one, head "),
+        (suite, suite / "more", 2, '"more/config.json" is of no run in it'),
+    ):
+        for number, expected in enumerate((0, code)):
+            out = tmp_path / f"{folder.name}{number}" / "ours"
+            assert main(["bundle", str(folder), "--out", str(out)]) == 0
+            fill(out, **KEYS)
+            found, said, _ = build(out, capsys)
+            assert found == expected and (not number or named in said), said
+            shutil.copytree(late, copy, dirs_exist_ok=True)
 
 
 def renamed(members):
