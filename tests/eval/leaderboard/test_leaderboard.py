@@ -314,7 +314,7 @@ def test_runs_that_the_board_does_not_show_are_no_copies(tmp_path, capsys):
     shutil.copytree(tmp_path / "runs" / "shown", suite / cell.folder)
     for folder, copy, code, named in (
         (tmp_path / "runs", tmp_path / "runs" / "again", 1, "ours/bundle.zip: 2 of its runs are one, head "),
-        (suite, suite / "more", 2, 'of no run in it'),
+        (suite, suite / "more", 2, "of no run in it"),
     ):
         for number, expected in enumerate((0, code)):
             out = tmp_path / f"{folder.name}{number}" / "ours"
