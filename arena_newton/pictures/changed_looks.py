@@ -415,7 +415,7 @@ def _with_figures(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Shapes and luminance of pictures with ellipses and boxes, the last shapes, upright before what may be hidden.
 
-    They are shaded from one side to the other, and get their colours with all other shapes, or none and do not show.
+    They are shaded from one side to the other, and get colours as all shapes do; without one they show what was there.
     """
     (height, width), (batch, _), device = size, shapes.shape, shapes.device
     middle, half, kind = torch.rand((5, batch, FIGURES, 1, 1), device=device).split((2, 2, 1))
