@@ -217,10 +217,11 @@ def _audit(
             checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: a run of {number}; rates are of whole plans")
     checked.notes += [f"{note} ({counted(runs, 'run')})" if runs > 1 else note for note, runs in notes.items()]
     checked.notes += sureness(checked.audits)
-    heads = Counter(head for audit in checked.audits if (head := audit.results.get("head")) is not None)
-    for head in (head for head, times in heads.items() if times > 1):  # copies make a draw of another run less likely
-        checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: {heads[head]} of its runs are one, head {head}")
-    found = joint_head([audit.results.get("head") for audit in checked.audits]) or ""
+    heads = [audit.results.get("head") for audit in checked.audits]
+    for head, times in Counter(heads).items():
+        if head is not None and times > 1:  # copies make a draw of another run less likely
+            checked.faults.append(f"{checked.name}/{BUNDLE_FILE}: {times} of its runs are one, head {head}")
+    found = joint_head(heads) or ""
     if not found:
         checked.faults.append(
             f"{checked.name}/{BUNDLE_FILE}: a version without chain wrote its lines; they have no head"

@@ -45,7 +45,7 @@ def test_the_generalist_plays_every_cell(tmp_path):
     assert {cell.mode for cell in swapped} == {"base"}
 
 
-def test_rows_of_wrists_differ_by_their_cameras(tmp_path):
+def test_rows_of_wrists_differ_by_their_cameras():
     """One row sees through the head camera alone, and the sets of both have all that the other one sees through."""
     plan = read_plan("wrists")
     front, wrists = plan.rows
