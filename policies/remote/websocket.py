@@ -31,6 +31,11 @@ __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "htt
 
 GATEWAY_STATUS = (502, 503, 504)
 """Status of a gateway whose server is not there."""
+OPENING = 10.0
+"""Longest opening handshake over TLS, after which a new connection is tried [s].
+
+Up to Python 3.12 a session ticket that one thread reads while another sends can lose the request for good.
+"""
 CLOSING = 0.5
 """Longest closing handshake [s]."""
 MOST_PAGE = 2**20
@@ -138,7 +143,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
                 ssl=self.owner.context,
                 compression=None,
                 proxy=None,
-                open_timeout=left,
+                open_timeout=left if self.owner.context is None else min(left, OPENING),
                 ping_interval=None,
                 close_timeout=CLOSING,
                 max_size=MAX_REPLY,
@@ -156,6 +161,10 @@ class SocketLink(ServerLink[SocketRequest, object]):
             raise ValueError(f"no websocket ({cause(error)})") from error
         except ConnectionClosed as error:  # while the opening request was sent
             raise AskAgain("the connection was closed before it was open") from error
+        except TimeoutError as error:
+            if time.monotonic() >= end:
+                raise
+            raise AskAgain(f"the connection was not open within {OPENING:g} s") from error
         try:
             return self.greet(end)
         except Exception:  # without its greeting a connection is of no use

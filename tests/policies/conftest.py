@@ -1,7 +1,6 @@
 """Lets the tests of policies import what they share, and makes a certificate for them."""
 
 import shutil
-import ssl
 import subprocess
 import sys
 from pathlib import Path
@@ -41,7 +40,8 @@ def make_certificate():
 @pytest.fixture(scope="session")
 def certificate(make_certificate, tmp_path_factory):
     """File of a certificate, and the context of a server that has it."""
+    from arena_newton.policies.serve.serve_command import make_tls
+    from arena_newton.policies.serve.serve_options import ServeOptions
+
     cert, key = make_certificate(tmp_path_factory.mktemp("certificate"), "-nodes")
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(cert, key)
-    return cert, context
+    return cert, make_tls(ServeOptions(policy="x", tls_cert=str(cert), tls_key=str(key)))

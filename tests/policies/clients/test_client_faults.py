@@ -430,6 +430,24 @@ def test_a_connection_that_breaks_while_it_opens_is_opened_again(monkeypatch):
     assert len(opened) == 2
 
 
+def test_a_request_that_is_lost_over_tls_is_sent_again(monkeypatch, certificate):
+    """A handshake that nobody answers is given up after a while, long before the deadline of the query."""
+    server, opened = SocketServer("openpi", facts(), ssl=certificate[1]), []
+
+    def losing(*arguments, **more):
+        opened.append(more["open_timeout"])
+        if len(opened) == 1:
+            raise TimeoutError("timed out while waiting for handshake response")
+        return connect(*arguments, **more)
+
+    connect = websocket.connect
+    monkeypatch.setattr(websocket, "connect", losing)
+    policy = asking(f"openpi+wss://127.0.0.1:{server.port}", timeout=PLENTY, retries=1, verify_ssl=False)
+    policy.check()
+    policy.close()
+    assert opened == [websocket.OPENING] * 2
+
+
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
 def test_wss(protocol, certificate):
     """A certificate that nobody vouches for is refused before the first episode, or taken on request."""

@@ -159,6 +159,7 @@ def test_tls(served, certificate):
     one = served(Remembers(), tls=context)
     with connect(f"wss://127.0.0.1:{one.port}", ssl=trust) as client:
         assert openpi_codec.unpack_metadata(client.recv(timeout=PLENTY), "server")[0] == one.server.facts
+        assert client.socket.session is not None and not client.socket.session.has_ticket
     with pytest.raises((OSError, WebSocketException)):
         one.socket(open_timeout=2)
     two = served(Remembers(), "arena", tls=context)
