@@ -48,6 +48,8 @@ class PlanSettings:
     """Minutes of --minutes that are kept for decoding, evaluation and tables."""
     gpus: int = 1
     """GPUs of a training."""
+    trainings: int = 1
+    """Trainings at once on the same GPUs."""
     recordings: int = 4
     """Recordings at once."""
     datasets: int = 4
@@ -132,7 +134,8 @@ def read_plan(given: str) -> LoopPlan:
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected numbers 1 to 9999")
     if len(set(settings.seeds)) < len(settings.seeds):
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected each once")
-    least = {"minutes": 0.0, "reserve": 0.0, "gpus": 1, "recordings": 1, "datasets": 1, "cells": 1, "again": 0}
+    least = {"minutes": 0.0, "reserve": 0.0, "again": 0}
+    least |= dict.fromkeys(("gpus", "trainings", "recordings", "datasets", "cells"), 1)
     for key, low in least.items():
         if not low <= getattr(settings, key):
             raise InputError(f"{path}: [plan]: {key} is {getattr(settings, key)}, expected at least {low:g}")

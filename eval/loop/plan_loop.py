@@ -110,8 +110,8 @@ def training_minutes(plan: LoopPlan, given: float | None, out: Path, trainings: 
 
 
 def _trainings_at_once(plan: LoopPlan, gpus: int) -> int:
-    """Trainings that run at once, each on GPUs of its own."""
-    return max(1, gpus // max(1, plan.settings.gpus))
+    """Trainings that run at once, on GPUs of their own or as many on the same ones as the plan says."""
+    return max(1, gpus // plan.settings.gpus) * plan.settings.trainings
 
 
 def _at_once(plan: LoopPlan, gpus: int) -> dict[str, int]:

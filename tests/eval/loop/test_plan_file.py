@@ -37,7 +37,7 @@ def test_the_generalist_plays_every_cell(tmp_path):
     cells = cells_of(plan, "all", tmp_path)
     assert len(cells) == 3 * 14 * 7 and {cell.episodes for cell in cells} == {60}
     assert {cell.policy for cell in cells} == {"all#1", "all#2", "all#3"}
-    assert {(cell.tracker, cell.mode) for cell in cells_of(plan, "twist2", tmp_path)} == {
+    assert {(cell.tracker, cell.mode) for cell in cells_of(read_plan("ablation"), "twist2", tmp_path)} == {
         ("twist2", "base"),
         ("sonic", "base"),
     }
@@ -53,24 +53,29 @@ def test_rows_of_wrists_differ_by_their_cameras():
     assert replace(wrists.train, cameras=("front",)) == front.train and len(plan.record.cameras) == 3
 
 
-def test_rows_of_the_generalist_are_its_ablation():
-    """Each row differs from the first by what its name says, and all take the same demonstrations, steps and time."""
-    plan = read_plan("generalist")
-    first, *others = plan.rows
-    differ = {
-        row.name: {name for name, value in vars(row.train).items() if value != getattr(first.train, name)}
-        for row in others
+def test_rows_differ_by_what_they_are_named_after():
+    """Each row differs from its plan's first by what its name says; the rest is the same, and so are the steps."""
+    looks = {"looks", "look_changes"}
+    rows = {"goals": looks, **dict.fromkeys(("bold", "figures"), looks | {"task_weights"})}
+    ablation = {"none": looks | {"recipe_values"}, "augmentation": looks, "untold": {"tracker_vector"}}
+    ablation |= {
+        **dict.fromkeys(("shapes", "light"), {"look_changes"}),
+        **dict.fromkeys(("plain-02", "plain-06"), {"looks"}),
     }
-    expected = {"none": {"looks", "look_changes", "recipe_values"}, "augmentation": {"looks", "look_changes"}}
-    expected |= {name: {"look_changes"} for name in ("shapes", "light", "keys-seldom")}
-    expected |= {
-        "goals": {"looks", "look_changes"},
-        **dict.fromkeys(("bold", "figures"), {"looks", "look_changes", "task_weights"}),
-        "plain-02": {"looks"},
-        "plain-06": {"looks"},
-        "untold": {"tracker_vector"},
-    }
-    assert differ == expected | {"twist2": set(), "sonic": set()}
+    for name, expected in {"generalist": rows, "ablation": ablation | {"twist2": set(), "sonic": set()}}.items():
+        first, *others = read_plan(name).rows
+        assert expected == {
+            row.name: {key for key, value in vars(row.train).items() if value != getattr(first.train, key)}
+            for row in others
+        }
+
+
+def test_the_ablation_has_the_demonstrations_and_the_recipe_of_the_generalist():
+    """Its first row is the generalist's, with fewer steps of half as many samples on one GPU."""
+    ablation, plan = read_plan("ablation"), read_plan("generalist")
+    assert (ablation.record, ablation.attempts, ablation.parts) == (plan.record, plan.attempts, plan.parts)
+    mine, theirs = (vars(one.rows[0].train) for one in (ablation, plan))
+    assert {key for key in mine if mine[key] != theirs[key]} == {"steps", "lr", "hold_out_every"}
 
 
 def test_commands_are_those_of_the_house(tmp_path):
@@ -136,6 +141,8 @@ def test_trainings_have_the_time_that_recording_leaves(tmp_path):
     assert training_minutes(plan, 24.0, tmp_path, 3, 6) == 24.0 - 6.5 - 4.0
     assert training_minutes(plan, 24.0, tmp_path, 3, 2) == 4.5
     assert training_minutes(plan, 24.0, tmp_path, 2, 4) == 13.5
+    shared = replace(plan, settings=replace(plan.settings, trainings=2))  # two of them share two GPUs
+    assert training_minutes(shared, 24.0, tmp_path, 4, 4) == 13.5
     with pytest.raises(InputError, match="^--minutes 9: recording and building took 4.0, nothing is left to train in"):
         training_minutes(plan, 9.0, tmp_path, 3, 6)
     with (tmp_path / "commands.jsonl").open("a") as file:
@@ -186,8 +193,8 @@ def test_an_unfit_plan_is_one_error(tmp_path, capsys, old, new, says):
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--plan", "mine"], "--plan mine: no such file; the package brings the plans generalist tiny"),
-        (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans generalist tiny"),
+        (["--plan", "mine"], "--plan mine: no such file; the package brings the plans ablation generalist tiny"),
+        (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans ablation generalist tiny"),
         (["--plan", "tiny", "--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--plan", "tiny", "--only", "train", "train"], "--only train: given twice"),
         (["--plan", "tiny", "--task", "boxing"], "--task: belongs to a loop without --plan, whose file says it"),
