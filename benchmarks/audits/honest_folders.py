@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from arena_newton import policies, tasks
 from arena_newton.errors import InputError
@@ -254,7 +255,8 @@ def honest_figures(options: HonestOptions) -> Iterator[BenchFigure]:
     """Folders of each kind, and those that an audit accuses."""
     folders, accused, again = Counter[str](), Counter[str](), 0
     first: dict[str, str] = {}
-    for name, faults, episodes in accusations(options.count, options.replay_every, options.seed):
+    found = accusations(options.count, options.replay_every, options.seed)
+    for name, faults, episodes in tqdm(found, total=options.count, unit="folder", desc="audited", leave=False):
         folders[name] += 1
         accused[name] += bool(faults)
         again += episodes
