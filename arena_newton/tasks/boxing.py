@@ -135,5 +135,6 @@ TASK = TaskSpec(
     semantic_change="shape",
     recolour={TARGET: 0.0},
     expert="arena_newton.policies.experts.boxing:BoxingExpert",
+    disturbance=2.0,
     sample=sample_target,
 )

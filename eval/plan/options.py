@@ -298,7 +298,7 @@ class _Demonstrations:
     disturb: bool = True
     """Add slow noise to what is executed, not to the recorded action, so that recoveries are recorded."""
     disturb_scale: float = 1.0
-    """Factor of the noise, beside that of each task (0.5 in pp_box and double_desk, which grasp; 1 in the others)."""
+    """Factor of the noise, beside that of each task (0.5 in pp_box and double_desk, 2 in boxing, 1 in others)."""
     seed_series: int = 0
     """Number of the series of seeds: another one gives other episodes."""
     cameras: tuple[str, ...] = ("front",)

@@ -194,7 +194,7 @@ def test_an_unfit_plan_is_one_error(tmp_path, capsys, old, new, says):
     ("flags", "says"),
     [
         (["--plan", "mine"], "--plan mine: no such file; the package brings the plans ablation generalist tiny"),
-        (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans ablation generalist tiny"),
+        (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans ablation generalist"),
         (["--plan", "tiny", "--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--plan", "tiny", "--only", "train", "train"], "--only train: given twice"),
         (["--plan", "tiny", "--task", "boxing"], "--task: belongs to a loop without --plan, whose file says it"),

@@ -135,14 +135,14 @@ def recording(**changes):
     return resolve(recording_run(options))
 
 
-def test_tasks_that_grasp_are_disturbed_less():
+def test_tasks_are_disturbed_by_factors_of_their_own():
     """The factor of task and flag scales deviations, not times; identity and files name both."""
     config = recording()
     levels = {task: disturbance_of(config, task, 10).levels for task in config.flags.task}
-    assert levels["boxing"].joints == 0.04 and levels["pp_box"].joints == levels["double_desk"].joints == 0.02
+    assert levels["boxing"].joints == 0.08 and levels["pp_box"].joints == levels["double_desk"].joints == 0.02
     assert levels["pp_box"].velocity == 0.04 and levels["pp_box"].yaw_rate == 0.06
     assert levels["pp_box"].joints_time == 0.3 and levels["pp_box"].yaw_leak == 10.0
-    scales = {"boxing": 1.0, "pp_box": 0.5, "double_desk": 0.5}
+    scales = {"boxing": 2.0, "pp_box": 0.5, "double_desk": 0.5}
     assert config.identity()["disturbance"]["scale"] == scales
     assert facts_of(config, "pp_box", "twist2", "base", {}, {})["disturbance"] == levels["pp_box"].describe()
     half = recording(disturb_scale=0.5)
