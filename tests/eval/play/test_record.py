@@ -88,7 +88,7 @@ def test_an_episodes_facts_name_no_folder_time_or_number_of_worlds(recorded):
     text = EpisodeFile(episode_files([recorded])[0]).text("arena_configuration")
     facts = json.loads(text)
     assert all(facts[key] for key in ("code", "checkpoint", "rules_hash", "scenes", "versions", "tracker_facts"))
-    assert facts["disturbance"]["velocity"] == 0.08 and facts["worlds"] is None and facts["versions"]["av"]
+    assert facts["disturbance"]["velocity"] == 0.16 and facts["worlds"] is None and facts["versions"]["av"]
     assert str(recorded) not in text and "started_at" not in text
 
 
