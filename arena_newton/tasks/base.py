@@ -354,12 +354,11 @@ class TaskSpec:
     expert: str | None = None
     """Class of its scripted expert as `module:attribute`; None: it has none."""
     disturbance: float = 1.0
-    """Factor of `noise_levels.NoiseLevels` when its demonstrations are recorded: of what an expert survives that from
-    which a learner gains most.
+    """Factor of `noise_levels.NoiseLevels` when its demonstrations are recorded.
 
     Measured, engine mujoco, tracker sonic, successes at 0, 0.35, 0.5 and 1: P&PBox 7/8, 6/8, 8/12, 2/12; DoubleDesk
-    8/8, 8/8, 11/12, 6/12 (docs/howto/train/recording.md). Tasks that grasp take 0.5, the others bear it whole.
-    Boxing takes 2: learners gain by it."""
+    8/8, 8/8, 11/12, 6/12 (docs/howto/train/recording.md). Tasks that grasp take 0.5; Boxing takes 2, by
+    which learners gained; the others bear it whole."""
     sample: Callable[[int, str, TaskRules], dict[str, Sample]] = sample_objects
     """Draws the samples: (episode seed, mode, rules) → record name → sample."""
     overlaps: tuple[Overlap, ...] = ()

@@ -256,7 +256,9 @@ def honest_figures(options: HonestOptions) -> Iterator[BenchFigure]:
     folders, accused, again = Counter[str](), Counter[str](), 0
     first: dict[str, str] = {}
     found = accusations(options.count, options.replay_every, options.seed)
-    for name, faults, episodes in tqdm(found, total=options.count, unit="folder", desc="audited", leave=False):
+    for name, faults, episodes in tqdm(
+        found, total=options.count, unit="folder", desc="audited", disable=None, leave=False
+    ):
         folders[name] += 1
         accused[name] += bool(faults)
         again += episodes

@@ -134,7 +134,7 @@ def plan_commands(
                 PlanCommand(
                     stage="train",
                     name=folder.name,
-                    words=partial(_trained, options, minutes, each, gpus),
+                    words=partial(_trained, options, minutes, each, max(1, gpus) * plan.settings.trainings),
                     done=partial(trained, folder),
                     after=tuple(f"build {dataset.name}" for dataset in datasets),
                     gpus=each,
@@ -218,9 +218,9 @@ def _recorded(flags: Sequence[str], folder: Path) -> list[str]:
     return [EVAL, "record", *flags]
 
 
-def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: int, gpus: int) -> list[str]:
-    """Begin a training, or go on with it."""
-    jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // max(1, gpus))
+def _trained(options: PolicyTrainOptions, minutes: Callable[[], float], each: int, parts: int) -> list[str]:
+    """Begin a training, or go on with it, on one of so many parts of the cores."""
+    jobs = options.jobs or max(1, len(os.sched_getaffinity(0)) // parts)
     options = continued(options)
     if options.resume is None:
         options = dataclasses.replace(options, minutes=0.0 if options.steps else minutes())

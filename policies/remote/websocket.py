@@ -32,9 +32,9 @@ __all__ = ["GATEWAY_STATUS", "SocketClient", "SocketLink", "SocketRequest", "htt
 GATEWAY_STATUS = (502, 503, 504)
 """Status of a gateway whose server is not there."""
 OPENING = 10.0
-"""Longest opening handshake over TLS, after which a new connection is tried [s].
+"""Least time of an opening handshake over TLS before another connection is tried, where several may be [s].
 
-Up to Python 3.12 a session ticket that one thread reads while another sends can lose the request for good.
+A session ticket that one thread reads while another sends can lose the request for good.
 """
 CLOSING = 0.5
 """Longest closing handshake [s]."""
@@ -106,7 +106,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
             if reply is not None:
                 return reply
         if self._socket is None:
-            facts = self.open(end)
+            facts = self.open(end, self.owner.retries + 1)
             reason = self.owner.refused(facts)
             if reason:
                 self.close()
@@ -126,8 +126,12 @@ class SocketLink(ServerLink[SocketRequest, object]):
             self.begun = True
         return self.query(request, end)
 
-    def open(self, end: float) -> ServedFacts:
+    def open(self, end: float, attempts: int = 1) -> ServedFacts:
         """Connect and greet.
+
+        Args:
+            end: Deadline on the monotonic clock [s].
+            attempts: Connections that may be tried until then; over TLS one of several does not take all the time.
 
         Raises:
             AskAgain: Nobody is there yet.
@@ -136,6 +140,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
         left = end - time.monotonic()
         if left <= 0:
             raise TimeoutError
+        patience = left if self.owner.context is None or attempts == 1 else max(left / attempts, OPENING)
         try:
             self._socket = connect(
                 self.owner.address.url,
@@ -143,7 +148,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
                 ssl=self.owner.context,
                 compression=None,
                 proxy=None,
-                open_timeout=left if self.owner.context is None else min(left, OPENING),
+                open_timeout=min(left, patience),
                 ping_interval=None,
                 close_timeout=CLOSING,
                 max_size=MAX_REPLY,
@@ -162,9 +167,9 @@ class SocketLink(ServerLink[SocketRequest, object]):
         except ConnectionClosed as error:  # while the opening request was sent
             raise AskAgain("the connection was closed before it was open") from error
         except TimeoutError as error:
-            if time.monotonic() >= end:
+            if patience >= left:
                 raise
-            raise AskAgain(f"the connection was not open within {OPENING:g} s") from error
+            raise AskAgain(f"the connection was not open within {patience:.1f} s") from error
         try:
             return self.greet(end)
         except Exception:  # without its greeting a connection is of no use
@@ -270,7 +275,7 @@ class SocketClient(RemoteClient[SocketRequest, object]):
         link = self._connections[0] = self._connect()
         for attempt in range(self.retries + 1):
             try:
-                self.greeting = link.open(time.monotonic() + self.timeout)
+                self.greeting = link.open(time.monotonic() + self.timeout, self.retries + 1)
                 break
             except TimeoutError:
                 link.close()

@@ -133,8 +133,8 @@ def open_endpoint(
 def make_tls(options: ServeOptions) -> ssl.SSLContext | None:
     """Context of `--tls-cert` and `--tls-key`; None without them.
 
-    It issues no session tickets: up to Python 3.12 a client that reads and writes in two threads, as those of
-    websockets do, loses about one request in a hundred when a ticket arrives while it sends.
+    It sends no session tickets after the handshake: a client that reads and writes in two threads, as those of
+    websockets do, can lose its request when one arrives while it sends.
 
     Raises:
         InputError: A file that cannot be used.

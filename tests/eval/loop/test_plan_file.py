@@ -132,6 +132,14 @@ def test_several_gpus_train_one_network(tmp_path):
         assert made(plan, tmp_path, gpus=gpus)["evaluate all"].gpus == ALL_GPUS
 
 
+def test_trainings_side_by_side_divide_the_cores(tmp_path, monkeypatch):
+    """Pictures are decoded by a part of the cores for each training that runs at once, on its GPUs or on others."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(16)))
+    for plan, gpus, jobs in (("generalist", 2, "8"), ("ablation", 2, "4"), ("ablation", 0, "8")):
+        words = list(made(read_plan(plan), tmp_path, gpus=gpus)["train all_1"].words())
+        assert words[words.index("--jobs") + 1] == jobs
+
+
 def test_trainings_have_the_time_that_recording_leaves(tmp_path):
     """Equal parts of it, by waves of those that run at once; too little is refused."""
     plan = read_plan("generalist")

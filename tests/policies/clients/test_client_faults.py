@@ -431,7 +431,7 @@ def test_a_connection_that_breaks_while_it_opens_is_opened_again(monkeypatch):
 
 
 def test_a_request_that_is_lost_over_tls_is_sent_again(monkeypatch, certificate):
-    """A handshake that nobody answers is given up after a while, long before the deadline of the query."""
+    """With attempts left a handshake that nobody answers is given up before the deadline; the last has all the time."""
     server, opened = SocketServer("openpi", facts(), ssl=certificate[1]), []
 
     def losing(*arguments, **more):
@@ -442,10 +442,30 @@ def test_a_request_that_is_lost_over_tls_is_sent_again(monkeypatch, certificate)
 
     connect = websocket.connect
     monkeypatch.setattr(websocket, "connect", losing)
-    policy = asking(f"openpi+wss://127.0.0.1:{server.port}", timeout=PLENTY, retries=1, verify_ssl=False)
+    for scheme, retries, patience in (("openpi+wss", 1, PLENTY / 2), ("openpi+wss", 60, websocket.OPENING)):
+        opened.clear()
+        policy = asking(f"{scheme}://127.0.0.1:{server.port}", timeout=PLENTY, retries=retries, verify_ssl=False)
+        policy.check()
+        policy.close()
+        assert opened == pytest.approx([patience] * 2, rel=0.01)
+
+
+@pytest.mark.parametrize(("tls", "retries"), [(True, 0), (False, 4)])
+def test_a_handshake_that_is_not_tried_again_has_all_the_time(monkeypatch, certificate, tls, retries):
+    """A server that is slow to take connections needs a longer deadline alone."""
+    server, opened = SocketServer("openpi", facts(), ssl=certificate[1] if tls else None), []
+
+    def noting(*arguments, **more):
+        opened.append(more["open_timeout"])
+        return connect(*arguments, **more)
+
+    connect = websocket.connect
+    monkeypatch.setattr(websocket, "connect", noting)
+    scheme = "openpi+wss" if tls else "openpi"
+    policy = asking(f"{scheme}://127.0.0.1:{server.port}", timeout=PLENTY, retries=retries, verify_ssl=False)
     policy.check()
     policy.close()
-    assert opened == [websocket.OPENING] * 2
+    assert opened == pytest.approx([PLENTY], rel=0.01)
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "vla-eval"])
