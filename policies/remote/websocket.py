@@ -140,7 +140,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
         left = end - time.monotonic()
         if left <= 0:
             raise TimeoutError
-        patience = left if self.owner.context is None or attempts == 1 else max(left / attempts, OPENING)
+        patience = left if self.owner.context is None or attempts == 1 else min(left, max(left / attempts, OPENING))
         try:
             self._socket = connect(
                 self.owner.address.url,
@@ -148,7 +148,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
                 ssl=self.owner.context,
                 compression=None,
                 proxy=None,
-                open_timeout=min(left, patience),
+                open_timeout=patience,
                 ping_interval=None,
                 close_timeout=CLOSING,
                 max_size=MAX_REPLY,
@@ -167,7 +167,7 @@ class SocketLink(ServerLink[SocketRequest, object]):
         except ConnectionClosed as error:  # while the opening request was sent
             raise AskAgain("the connection was closed before it was open") from error
         except TimeoutError as error:
-            if patience >= left:
+            if patience == left:
                 raise
             raise AskAgain(f"the connection was not open within {patience:.1f} s") from error
         try:

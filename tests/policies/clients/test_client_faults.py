@@ -412,59 +412,47 @@ def test_close_breaks_off_what_waits(running):
     assert not asking.is_alive()
 
 
-def test_a_connection_that_breaks_while_it_opens_is_opened_again(monkeypatch):
-    """A server that closes a connection before its greeting is asked once more, as one that is not there yet."""
-    server, opened = SocketServer("openpi", facts()), []
-
-    def breaking(*arguments, **more):
-        opened.append(arguments)
-        if len(opened) == 1:
-            raise ConnectionClosedError(None, None)
-        return connect(*arguments, **more)
-
-    connect = websocket.connect
-    monkeypatch.setattr(websocket, "connect", breaking)
-    policy = asking(f"openpi://127.0.0.1:{server.port}", retries=1)
-    policy.check()
-    policy.close()
-    assert len(opened) == 2
-
-
-def test_a_request_that_is_lost_over_tls_is_sent_again(monkeypatch, certificate):
-    """With attempts left a handshake that nobody answers is given up before the deadline; the last has all the time."""
-    server, opened = SocketServer("openpi", facts(), ssl=certificate[1]), []
-
-    def losing(*arguments, **more):
-        opened.append(more["open_timeout"])
-        if len(opened) == 1:
-            raise TimeoutError("timed out while waiting for handshake response")
-        return connect(*arguments, **more)
-
-    connect = websocket.connect
-    monkeypatch.setattr(websocket, "connect", losing)
-    for scheme, retries, patience in (("openpi+wss", 1, PLENTY / 2), ("openpi+wss", 60, websocket.OPENING)):
-        opened.clear()
-        policy = asking(f"{scheme}://127.0.0.1:{server.port}", timeout=PLENTY, retries=retries, verify_ssl=False)
-        policy.check()
-        policy.close()
-        assert opened == pytest.approx([patience] * 2, rel=0.01)
-
-
-@pytest.mark.parametrize(("tls", "retries"), [(True, 0), (False, 4)])
-def test_a_handshake_that_is_not_tried_again_has_all_the_time(monkeypatch, certificate, tls, retries):
-    """A server that is slow to take connections needs a longer deadline alone."""
-    server, opened = SocketServer("openpi", facts(), ssl=certificate[1] if tls else None), []
+def patiences(monkeypatch, fault=None):
+    """Time that each handshake from now on may take [s]; the first one ends in the fault."""
+    opened, connect = [], websocket.connect
 
     def noting(*arguments, **more):
         opened.append(more["open_timeout"])
+        if fault is not None and len(opened) == 1:
+            raise fault
         return connect(*arguments, **more)
 
-    connect = websocket.connect
     monkeypatch.setattr(websocket, "connect", noting)
-    scheme = "openpi+wss" if tls else "openpi"
+    return opened
+
+
+def checked(server, scheme, retries):
+    """Greet a server."""
     policy = asking(f"{scheme}://127.0.0.1:{server.port}", timeout=PLENTY, retries=retries, verify_ssl=False)
     policy.check()
     policy.close()
+
+
+def test_a_connection_that_breaks_while_it_opens_is_opened_again(monkeypatch):
+    """A server that closes a connection before its greeting is asked once more, as one that is not there yet."""
+    opened = patiences(monkeypatch, ConnectionClosedError(None, None))
+    checked(SocketServer("openpi", facts()), "openpi", retries=1)
+    assert len(opened) == 2
+
+
+@pytest.mark.parametrize(("retries", "share"), [(1, PLENTY / 2), (60, websocket.OPENING)])
+def test_a_request_that_is_lost_over_tls_is_sent_again(monkeypatch, certificate, retries, share):
+    """A handshake that nobody answers is given up after its share of the time, where another may be tried."""
+    opened = patiences(monkeypatch, TimeoutError("timed out while waiting for handshake response"))
+    checked(SocketServer("openpi", facts(), ssl=certificate[1]), "openpi+wss", retries)
+    assert opened == pytest.approx([share] * 2, rel=0.01)
+
+
+@pytest.mark.parametrize(("scheme", "retries"), [("openpi+wss", 0), ("openpi", 4)])
+def test_a_handshake_that_is_not_tried_again_has_all_the_time(monkeypatch, certificate, scheme, retries):
+    """A server that is slow to take connections needs a longer deadline alone."""
+    opened = patiences(monkeypatch)
+    checked(SocketServer("openpi", facts(), ssl=certificate[1] if scheme.endswith("wss") else None), scheme, retries)
     assert opened == pytest.approx([PLENTY], rel=0.01)
 
 
