@@ -123,7 +123,7 @@ def plan_commands(
     for task, tracker in itertools.product(plan.attempts, trackers):
         found += _demonstrations(plan, folders, task, tracker, device)
     for row in rows:
-        datasets = tuple(folders.dataset(*pair) for pair in itertools.product(plan.attempts, row.trackers))
+        datasets = tuple(folders.dataset(*pair) for pair in itertools.product(row.tasks, row.trackers))
         each = max(1, min(plan.settings.gpus, gpus))
         for seed in seeds:
             folder = folders.training(row, seed)
@@ -260,7 +260,7 @@ def _packed(
     suites = folders.suites(row)
     seed, others = middle(suites)
     training, out = str(folders.training(row, seed)), str(folders.packed(row))
-    words = [EVAL, "pack", training, "--out", out, "--tasks", *plan.attempts]
+    words = [EVAL, "pack", training, "--out", out, "--tasks", *row.tasks]
     for flag, some in () if plan.evaluate.get("max_steps") else (("--results", suites), ("--trainings", others)):
         words += [flag, *map(str, some)] if some else []
     return words

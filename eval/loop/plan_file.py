@@ -28,7 +28,7 @@ from arena_newton.policies.train.policy_options import PolicyTrainOptions, check
 __all__ = ["LoopPlan", "PlanRow", "PlanSettings", "policy_name", "read_plan", "suite_text"]
 
 TABLES = ("name", "plan", "record", "attempts", "parts", "train", "rows", "evaluate", "bars", "best")
-OF_ROW = ("name", "trackers", "modes")
+OF_ROW = ("name", "tasks", "trackers", "modes")
 """Keys of [[rows]] that are no flags of a training."""
 OWN = {"record": ("out", "shard", "episodes", "task"), "train": ("dataset", "out", "seed", "resume", "minutes")}
 """Flags that the plan itself gives."""
@@ -69,6 +69,8 @@ class PlanRow:
     name: str
     train: PolicyTrainOptions
     """Without datasets, folder and seed."""
+    tasks: tuple[str, ...]
+    """Tasks of its demonstrations, which it plays."""
     trackers: tuple[str, ...]
     """Trackers of its demonstrations."""
     modes: tuple[str, ...]
@@ -156,7 +158,7 @@ def read_plan(given: str) -> LoopPlan:
         at_once="worlds" not in record,
         attempts={task: int(number) for task, number in attempts.items()},
         parts=parts,
-        rows=_rows(path, content, options.tracker or ("twist2",), modes),
+        rows=_rows(path, content, {"tasks": [*attempts], "trackers": options.tracker or ("twist2",), "modes": modes}),
         evaluate=evaluate,
         bars={mode: _rates(f"{path}: [bars]: {mode}", value) for mode, value in _table(path, content, "bars").items()},
         best=_best(path, _table(path, content, "best")),
@@ -219,9 +221,7 @@ def _options[T](path: Path, key: str, table: Mapping[str, Json], kind: type[T]) 
         raise InputError(f"{where}: {error}") from None
 
 
-def _rows(
-    path: Path, content: Mapping[str, Json], trackers: Sequence[str], modes: Sequence[str]
-) -> tuple[PlanRow, ...]:
+def _rows(path: Path, content: Mapping[str, Json], all_: Mapping[str, Sequence[Json]]) -> tuple[PlanRow, ...]:
     tables, train = content.get("rows", []), _table(path, content, "train")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise InputError(f"{path}: expected tables [[rows]], at least one")
@@ -233,11 +233,12 @@ def _rows(
             raise InputError(f"{where}: expected a name of its own, of small letters, digits and -")
         flags = {key: value for key, value in table.items() if key not in OF_ROW}
         options = _options(path, "train", train | flags, PolicyTrainOptions)
-        mine, played = (_names(table.get(key, list(all_))) for key, all_ in (("trackers", trackers), ("modes", modes)))
-        for key, values, known in (("trackers", mine, trackers), ("modes", played, modes)):
-            if not values or not all(value in known for value in values):
-                raise InputError(f"{where}: {key} are {' '.join(map(str, values))}, known are {' '.join(known)}")
-        rows.append(PlanRow(name, options, mine, played))
+        mine = {key: _names(table.get(key, list(known))) for key, known in all_.items()}
+        for key, known in all_.items():
+            if not mine[key] or not all(value in known for value in mine[key]):
+                given, names = (" ".join(map(str, values)) for values in (mine[key], known))
+                raise InputError(f"{where}: {key} are {given}, known are {names}")
+        rows.append(PlanRow(name, options, **mine))
     return tuple(rows)
 
 
@@ -289,7 +290,7 @@ def _check(plan: LoopPlan) -> None:
 
 
 def suite_text(plan: LoopPlan, row: PlanRow, trainings: Mapping[int, Path]) -> str:
-    """The suite file of a row: its trainings on all tasks through all trackers.
+    """The suite file of a row: its trainings on its tasks through all trackers.
 
     Args:
         trainings: Seed → folder of the training.
@@ -297,7 +298,7 @@ def suite_text(plan: LoopPlan, row: PlanRow, trainings: Mapping[int, Path]) -> s
     trackers = plan.record.tracker or ("twist2",)
     lines = [f"name = {_toml(f'{plan.name}_{row.name}')}", "", "[defaults]"]
     lines += [f"{key} = {_toml(value)}" for key, value in plan.evaluate.items()]
-    axes = {"tasks": list(plan.attempts), "trackers": list(trackers), "modes": list(row.modes)}
+    axes = {"tasks": list(row.tasks), "trackers": list(trackers), "modes": list(row.modes)}
     lines += ["", "[matrix]", *(f"{key} = {_toml(value)}" for key, value in axes.items())]
     for seed, folder in trainings.items():
         entry = {"name": policy_name(row, seed), "family": row.train.policy, "spec": f"lerobot:{folder}"}
