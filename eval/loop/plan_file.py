@@ -55,7 +55,9 @@ class PlanSettings:
     datasets: int = 4
     """Datasets that are built at once."""
     cells: int = 1
-    """Processes that play cells, for each GPU."""
+    """Processes that play the cells of a suite, for each GPU."""
+    suites: int = 1
+    """Suites that are played at once, beside trainings of other rows."""
     again: int = 0
     """Times that a command is begun again that failed, as a killed one goes on where it was."""
     failures_too: bool = False
@@ -137,7 +139,7 @@ def read_plan(given: str) -> LoopPlan:
     if len(set(settings.seeds)) < len(settings.seeds):
         raise InputError(f"{path}: [plan]: seeds are {' '.join(map(str, settings.seeds))}, expected each once")
     least = {"minutes": 0.0, "reserve": 0.0, "again": 0}
-    least |= dict.fromkeys(("gpus", "trainings", "recordings", "datasets", "cells"), 1)
+    least |= dict.fromkeys(("gpus", "trainings", "recordings", "datasets", "cells", "suites"), 1)
     for key, low in least.items():
         if not low <= getattr(settings, key):
             raise InputError(f"{path}: [plan]: {key} is {getattr(settings, key)}, expected at least {low:g}")

@@ -25,7 +25,7 @@ from arena_newton.files.new_folder import held_folder
 from arena_newton.files.stored_json import read_regular
 from arena_newton.physics.devices import visible_gpus
 
-__all__ = ["PLAN_FLAGS", "PLAN_COPY", "run", "training_minutes"]
+__all__ = ["PLAN_FLAGS", "PLAN_COPY", "commands_at_once", "run", "training_minutes"]
 
 PLAN_COPY = "plan.toml"
 """The plan in the folder that it is played in."""
@@ -82,7 +82,7 @@ def run(options: LoopOptions) -> int:
             minutes=lambda: training_minutes(plan, options.minutes, out, len(rows) * len(seeds), len(gpus)),
             middle=plan_report.middle_training,
         )
-        player = CommandPlayer(out, gpus, _at_once(plan, len(gpus)), held, plan.settings.again)
+        player = CommandPlayer(out, gpus, commands_at_once(plan, len(gpus)), held, plan.settings.again)
         return _play(player, _chosen(commands, options.only), plan, folders, options)
 
 
@@ -114,10 +114,11 @@ def _trainings_at_once(plan: LoopPlan, gpus: int) -> int:
     return max(1, gpus // plan.settings.gpus) * plan.settings.trainings
 
 
-def _at_once(plan: LoopPlan, gpus: int) -> dict[str, int]:
+def commands_at_once(plan: LoopPlan, gpus: int) -> dict[str, int]:
     """Commands of each stage at once."""
     settings = plan.settings
-    return {"record": settings.recordings, "build": settings.datasets, "train": _trainings_at_once(plan, gpus)}
+    most = {"record": settings.recordings, "build": settings.datasets, "evaluate": settings.suites}
+    return most | {"train": _trainings_at_once(plan, gpus)}
 
 
 def _is_this(out: Path, plan: LoopPlan) -> None:

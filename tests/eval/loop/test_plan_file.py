@@ -13,7 +13,7 @@ from arena_newton.eval.loop import plan_report
 from arena_newton.eval.loop.loop_requirements import SHIPPED
 from arena_newton.eval.loop.plan_commands import ALL_GPUS, PlanFolders, plan_commands
 from arena_newton.eval.loop.plan_file import read_plan, suite_text
-from arena_newton.eval.loop.plan_loop import training_minutes
+from arena_newton.eval.loop.plan_loop import commands_at_once, training_minutes
 from arena_newton.eval.suites.matrix_cells import expand_cells
 from arena_newton.eval.suites.suite_file import read_suite_file
 
@@ -41,8 +41,29 @@ def test_the_generalist_plays_every_cell(tmp_path):
         ("twist2", "base"),
         ("sonic", "base"),
     }
+    cells = cells_of(read_plan("singles"), "boxing-sonic", tmp_path)
+    assert {(cell.task, cell.tracker, cell.mode) for cell in cells} == {
+        ("boxing", "twist2", "base"),
+        *(("boxing", "sonic", mode) for mode in ("base", "execution", "dynamics")),
+    }
     swapped = [cell for cell in cells_of(read_plan("tiny"), "own", tmp_path) if cell.tracker not in cell.trained_on]
     assert {cell.mode for cell in swapped} == {"base"}
+
+
+def test_a_row_of_one_task_and_tracker_has_its_demonstrations_alone(tmp_path):
+    """Each of the fourteen is trained on its own dataset, which it waits for, and packed for its task."""
+    plan = read_plan("singles")
+    assert {(row.tasks, row.trackers) for row in plan.rows} == {
+        ((task,), (tracker,)) for task in plan.attempts for tracker in plan.record.tracker
+    }
+    commands = made(plan, tmp_path, rows=[plan.row("boxing-sonic")], seeds=[1])
+    training = commands["train boxing-sonic_1"]
+    words = training.words()
+    assert training.after == ("build boxing_sonic",)
+    assert words[words.index("--dataset") + 1 : words.index("--recipe")] == [str(tmp_path / "datasets/boxing_sonic")]
+    assert commands_at_once(plan, 1) == {"record": 18, "build": 8, "train": 4, "evaluate": 7}
+    card = commands["card boxing-sonic"].words()
+    assert card[card.index("--tasks") + 1 :] == ["boxing"]
 
 
 def test_rows_of_wrists_differ_by_their_cameras():
@@ -171,6 +192,7 @@ BAD = [
     ('balance = "task"', 'balance = "all"', "[[rows]] all: --balance all: unknown"),
     ('name = "own"', 'name = "all"', "[[rows]] all: expected a name of its own"),
     ('trackers = ["twist2"]', 'trackers = ["pd"]', "[[rows]] own: trackers are pd, known are twist2 sonic"),
+    ('trackers = ["twist2"]', 'tasks = ["chess"]', "[[rows]] own: tasks are chess, known are boxing vis_navi"),
     ("repeats = 2", "repeats = 0", "[evaluate]: [defaults]: --repeats 0"),
     ("repeats = 2", "chunks = 2", "[evaluate]: [defaults]: chunks is unknown"),
     ("seeds = [1, 2]", "seeds = [1, 1]", "[plan]: seeds are 1 1, expected each once"),
@@ -201,7 +223,7 @@ def test_an_unfit_plan_is_one_error(tmp_path, capsys, old, new, says):
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--plan", "mine"], "--plan mine: no such file; the package brings the plans ablation generalist tiny"),
+        (["--plan", "mine"], "--plan mine: no such file; the package brings the plans ablation generalist singles"),
         (["--plan", "."], "--plan .: is a folder, expected a file; the package brings the plans ablation generalist"),
         (["--plan", "tiny", "--seeds", "1", "1"], "--seeds 1: given twice"),
         (["--plan", "tiny", "--only", "train", "train"], "--only train: given twice"),
