@@ -64,7 +64,7 @@ def lerobot_eval_figures(options: PeerOptions) -> Iterator[BenchFigure]:
         yield PAIR.missing(label, reason)
         return
     checkpoint = SHIPPED if options.checkpoint is None else user_path(options.checkpoint)
-    checkpoint = checkpoint_folder(checkpoint, "--checkpoint")
+    checkpoint = checkpoint_folder(checkpoint, "--checkpoint ")
     rounds, plays, notes = [], [], []
     for _ in range(options.long_rounds):
         with tempfile.TemporaryDirectory() as made:

@@ -42,7 +42,7 @@ INNER = {
         | replay_dataset | replay | lerobot | experts learned remote | serve | train | teleop | policy_check""",
     f"{PACKAGE}.policies.train": """frames network_memory policy_options teachable_network training_log
         | checkpoint_packing families stored_flags teachable | network_compiler | policy_trainer | training_state
-        | training_loop | training | training_check __main__""",
+        | trained_start training_loop | training | training_check __main__""",
     f"{PACKAGE}.trackers": """interface motions | base | inference | front_end
         | evaluation mjlab pd sonic train twist2 | evaluate tracker_check __main__""",
     f"{PACKAGE}.trackers.train": """checkpoint curves model references train_options | export logger sampling simulation

@@ -119,7 +119,7 @@ def run(options: ProtocolOptions) -> int:
         StorageError: A file cannot be written.
     """
     checkpoint = SHIPPED if options.checkpoint is None else user_path(options.checkpoint)
-    checkpoint = checkpoint_folder(checkpoint, "--checkpoint")
+    checkpoint = checkpoint_folder(checkpoint, "--checkpoint ")
     protocols = _checked(options, checkpoint)
     out = user_path(options.out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -66,7 +66,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     (given,) = checkpoints
     if options.out is not None and not options.out.strip():
         raise InputError("--out: is empty, name a folder")
-    folder = checkpoint_folder(given, "pack")
+    folder = checkpoint_folder(given, "pack ")
     checkpoint = read_act_checkpoint(folder)
     facts = checkpoint.facts
     before = read_card(folder) if (folder / CARD_FILE).is_file() else None  # of one that is packed again

@@ -290,7 +290,7 @@ def _checkpoint(scheme: str, argument: str) -> Path:
     """Folder of a checkpoint that has weights."""
     if not argument:
         raise InputError(f"spec {scheme}: names no checkpoint, expected {scheme}:<folder>")
-    folder = checkpoint_folder(Path(argument).expanduser(), f"spec {scheme}")
+    folder = checkpoint_folder(Path(argument).expanduser(), f"spec {scheme}:")
     if not any(folder.glob("*.safetensors")):
         raise InputError(f"spec {scheme}:{argument}: {folder} holds no weights (no .safetensors)")
     return folder

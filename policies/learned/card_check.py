@@ -21,6 +21,7 @@ def training_entries(facts: CheckpointFacts) -> dict[str, object]:
         "recipe": facts.recipe,
         "steps": facts.steps,
         "seed": facts.seed,
+        "started_from": facts.started_from,
         "gpu_minutes": facts.minutes,
         "processes": facts.processes,
         "device": facts.device,

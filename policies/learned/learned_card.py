@@ -100,6 +100,8 @@ class PolicyCard:
     steps: int = 0
     """Optimizer steps."""
     seed: int = 0
+    started_from: str = ""
+    """First 12 hex digits of the SHA-256 of the weights that the training began with; empty: new ones."""
     gpu_minutes: float = 0.0
     """Time of the training [min], of each of its processes."""
     processes: int = 1
@@ -151,6 +153,7 @@ class PolicyCard:
             "samples with changed looks": ", ".join(self.looks).replace("=", " "),
             "training": f"`{self.command}`" if self.command else "",
             "optimizer steps": f"{self.steps:,}, seed {self.seed}",
+            "began with the weights": self.started_from,
             "GPU minutes": f"{self.processes * self.gpu_minutes:.1f} on {self._devices()}",
             "packed by": f"`{self.packed_by}`" if self.packed_by else "",
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",

@@ -69,6 +69,8 @@ class CheckpointFacts:
     steps: int = 0
     """Optimizer steps."""
     seed: int = 0
+    started_from: str = ""
+    """First 12 hex digits of the SHA-256 of the weights that it began with; empty: new ones."""
     minutes: Annotated[float, Fit("a time", lambda value: abs(value) < 1e12)] = 0.0
     """Time of the training [min]."""
     processes: Annotated[int, Fit("1 or more", lambda value: value >= 1)] = 1
@@ -142,15 +144,15 @@ def vector_of(tasks: Sequence[str], trackers: Sequence[str], task: str, tracker:
     return vector
 
 
-def checkpoint_folder(path: Path, flag: str = "--policy lerobot") -> Path:
+def checkpoint_folder(path: Path, flag: str = "--policy lerobot:") -> Path:
     """The checkpoint at a path: a folder with `config.json`, or the last checkpoint of a training's folder.
 
     Raises:
         InputError: There is none.
     """
     if not path.is_dir():
-        raise InputError(f"{flag}:{path}: no such folder")
+        raise InputError(f"{flag}{path}: no such folder")
     for folder in (path, *(path / inside for inside in INSIDE)):
         if (folder / CONFIG_FILE).is_file():
             return folder
-    raise InputError(f"{flag}:{path}: holds no checkpoint of LeRobot (no {CONFIG_FILE}, also not in {INSIDE[1]})")
+    raise InputError(f"{flag}{path}: holds no checkpoint of LeRobot (no {CONFIG_FILE}, also not in {INSIDE[1]})")

@@ -36,6 +36,7 @@ from arena_newton.robot.canonical import ACTION_WIDTH, STATE_WIDTH
 __all__ = [
     "FAMILY_TYPES",
     "IMAGES",
+    "PROCESSORS",
     "STATE",
     "TASK_VECTOR",
     "WEIGHTS",

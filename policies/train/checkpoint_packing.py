@@ -225,7 +225,7 @@ def training_command(facts: CheckpointFacts) -> str:
         default = list(one.default) if isinstance(one.default, tuple) else one.default
         if one.name in UNTOLD or value is None or (value == default and one.name not in ("policy", "recipe")):
             continue
-        if one.name in ("dataset", "weights"):
+        if one.name in ("dataset", "weights", "start_from"):
             value = [Path(str(path)).name for path in (value if isinstance(value, list) else [value])]
         words += typed(one.name, value)
     command = shell_command("arena_newton.policies.train", *words)

@@ -94,6 +94,9 @@ class PolicyTrainOptions:
     device: Device[str] = "auto"
     weights: str = ""
     """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
+    start_from: str = ""
+    """Begin with the weights of a trained policy of the same network: folder of a training, checkpoint or packed
+    policy, or `learned`, the one that ships. Family, recipe and labels are its own where they are not named."""
     save_every: int = field(default=5000, metadata=bounds(0))
     """Steps between checkpoints; 0: only the last one."""
     keep: int = field(default=2, metadata=bounds(0))
@@ -268,6 +271,8 @@ def check_numbers(options: PolicyTrainOptions) -> None:
     check_choices(options.policy, options.recipe, options.dataset, compiled=options.compile)
     if options.steps and options.minutes:
         raise InputError("--steps: is given by --minutes too; drop one of them")
+    if options.start_from and options.weights:
+        raise InputError("--weights: are those of --start-from; drop one of them")
     if options.labels not in ("", *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)

@@ -38,6 +38,7 @@ from arena_newton.policies.train.policy_options import (
 )
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
+from arena_newton.policies.train.trained_start import TrainedStart, like_start, of_training, read_start
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
 from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
 
@@ -53,7 +54,7 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     Args:
         options: Flags. With `resume` those of the interrupted training hold; of those that may differ, what is not
             at its default is taken.
-        named: With `resume`, fields that count though they are at their default.
+        named: Fields that were given, which count though they are at their default.
 
     Returns:
         Folder of the last checkpoint, which `--policy lerobot:` and LeRobot load.
@@ -78,7 +79,15 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
             if not quiet:
                 print(f"finished already, after {counted(progress.step, 'step')}: {checkpoint / PRETRAINED_MODEL_DIR}")
             return checkpoint / PRETRAINED_MODEL_DIR
+    start: TrainedStart | None = None
+    if options.start_from and checkpoint is None:
+        start = read_start(options.start_from)
+        options = like_start(options, start.facts, named)
+    elif options.start_from and checkpoint is not None:
+        start = of_training(checkpoint)
     settings = chosen_recipe(options) if checkpoint is None else stored_recipe(checkpoint)
+    if start is not None:
+        settings = start.check(settings)
     out = options.out or default_folder(options)
     if options.resume is None:
         check_new(out)
@@ -86,7 +95,7 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     try:
         with _group(device, processes), fast_kernels(device):
-            return _train(options, settings, out, device, processes, progress, checkpoint)
+            return _train(options, settings, out, device, processes, progress, checkpoint, start)
     except torch.OutOfMemoryError as error:
         text = " ".join(str(error).split())[:160]
         raise ArenaError(
@@ -102,6 +111,7 @@ def _train(
     processes: Processes,
     progress: TrainingProgress | None,
     checkpoint: Path | None,
+    start: TrainedStart | None,
 ) -> Path:
     speaks = processes.first and not options.quiet
     if options.compile:
@@ -146,16 +156,24 @@ def _train(
         key: {name: torch.from_numpy(np.array(value)) for name, value in of.items()}
         for key, of in statistics(datasets, trained, settings.labels).items()
     }
+    if start is not None:
+        stats |= start.stats
     if settings.cut_pad and camera_fit(store) != "pad":
         settings = dataclasses.replace(settings, cut_pad=False)
     vector = task_vector(store, settings)
     trackers = tracker_vector(store) if vector and options.tracker_vector else ()
+    if start is not None:
+        vector, trackers = start.vector(vector, trackers, {tracker for _, tracker in store.pairs if tracker})
     if vector:
         ones = torch.ones(len(vector_of(vector, trackers, "", "")))
         zeros = torch.zeros_like(ones)
         stats[VECTOR_KEY] = {"mean": zeros, "std": ones, "min": zeros, "max": ones, "q01": zeros, "q99": ones}
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
+    if start is not None:
+        start.put_into(model, vector, trackers)
+        if speaks:
+            print(f"begins with the weights of {start.folder} ({start.digest})", flush=True)
     batches = make_batches(model, store, vector, trackers)
     trainer = PolicyTrainer(
         model,
@@ -184,6 +202,7 @@ def _train(
         tasks=tuple(task for task in store.tasks if task),
         trackers=tuple(sorted({tracker for dataset in datasets for tracker in dataset.trackers})),
         seed=settings.seed,
+        started_from="" if start is None else start.facts.started_from if progress is not None else start.digest,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         processes=processes.count,
         datasets=tuple(dataset.described for dataset in datasets),

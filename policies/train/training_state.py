@@ -11,7 +11,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +42,8 @@ __all__ = [
     "check_new",
     "checkpoint_name",
     "last_checkpoint",
+    "put_weights",
+    "read_tensors",
     "remove_older",
     "restore",
     "write_checkpoint",
@@ -190,8 +192,27 @@ def restore(trainer: PolicyTrainer, checkpoint: Path) -> None:
     Raises:
         InputError: A file is absent, damaged or of another network.
     """
-    weights = _tensors(checkpoint / PRETRAINED_MODEL_DIR / WEIGHTS)
-    own = trainer.model.policy.state_dict()
+    put_weights(trainer.model.policy, checkpoint / PRETRAINED_MODEL_DIR / WEIGHTS)
+    _read_optimizer(trainer.optimizer, checkpoint / TRAINING_STATE_DIR)
+    trainer.step = TrainingProgress.read(checkpoint).step
+
+
+def put_weights(
+    policy: torch.nn.Module,
+    path: Path,
+    fit: Callable[[dict[str, torch.Tensor], dict[str, torch.Tensor]], None] | None = None,
+) -> None:
+    """Put the weights of a file into a policy, all of them.
+
+    Args:
+        fit: Changes the file's tensors, given them and the policy's own.
+
+    Raises:
+        InputError: The file is absent, damaged or of another network.
+    """
+    weights, own = read_tensors(path), policy.state_dict()
+    if fit is not None:
+        fit(weights, own)
     tied = {tensor.data_ptr() for name, tensor in own.items() if name in weights}
     missing = [
         name
@@ -202,12 +223,10 @@ def restore(trainer: PolicyTrainer, checkpoint: Path) -> None:
     unlike = [name for name in own if name in weights and own[name].shape != weights[name].shape]
     for names, words in ((missing, "lacks"), (unknown, "has unknown"), (unlike, "has another shape of")):
         if names:
-            raise InputError(f"{checkpoint / PRETRAINED_MODEL_DIR / WEIGHTS}: {words} {names[0]}")
+            raise InputError(f"{path}: {words} {names[0]}")
     with torch.no_grad():
         for name, tensor in weights.items():
             own[name].copy_(tensor)
-    _read_optimizer(trainer.optimizer, checkpoint / TRAINING_STATE_DIR)
-    trainer.step = TrainingProgress.read(checkpoint).step
 
 
 def _say_final_paths(growing: Path, final: Path) -> None:
@@ -246,7 +265,7 @@ def _read_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
         for number, parameter in zip(stored["params"], group["params"], strict=True)
     }
     state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in _tensors(path).items():
+    for name, tensor in read_tensors(path).items():
         parts = name.split("/")
         if len(parts) != 3 or parts[0] != "state" or not parts[1].isdigit() or int(parts[1]) not in parameters:
             raise InputError(f"{path}: {name[:80]} is no moment of this network's optimizer")
@@ -261,7 +280,7 @@ def _read_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
     optimizer.load_state_dict({"state": state, "param_groups": own["param_groups"]})
 
 
-def _tensors(path: Path) -> dict[str, torch.Tensor]:
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     """Tensors of a file.
 
     Raises:

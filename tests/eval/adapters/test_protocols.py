@@ -91,7 +91,7 @@ def test_any_bit_counts():
         ({"first": 0}, "--first 0"),
         ({"max_steps": 0}, "--max-steps 0"),
         ({"task": "golf"}, "golf"),
-        ({"checkpoint": "/nowhere"}, "--checkpoint:/nowhere: no such folder"),
+        ({"checkpoint": "/nowhere"}, "--checkpoint /nowhere: no such folder"),
         ({"protocols": ("learned",)}, "none is left"),
     ],
 )

@@ -380,7 +380,7 @@ def test_results_of_a_checkpoint_are_those_of_its_packed_form(tmp_path):
     ("arguments", "said"),
     [
         (["pack"], "pack: name the checkpoint"),
-        (["pack", "nowhere"], "pack:nowhere: no such folder"),
+        (["pack", "nowhere"], "pack nowhere: no such folder"),
         (["pack", "."], "holds no checkpoint"),
         (["pack", ".", "--out", ""], "--out: is empty, name a folder"),
     ],

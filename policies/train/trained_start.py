@@ -1,0 +1,159 @@
+"""A trained policy with whose weights a training begins: its statistics, and its vector of tasks and trackers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
+from arena_newton.errors import InputError
+from arena_newton.files.stored_json import read_object
+from arena_newton.policies.learned.learned_card import SHIPPED
+from arena_newton.policies.lerobot.checkpoint_facts import NORMALISES, CheckpointFacts, checkpoint_folder
+from arena_newton.policies.lerobot.checkpoint_reader import PROCESSORS, WEIGHTS, read_checkpoint
+from arena_newton.policies.lerobot.picture_preparation import MOST_JSON
+from arena_newton.policies.recipes.training_recipe import TrainingRecipe
+from arena_newton.policies.train.families.policy_model import ACTION, STATE, TrainableModel
+from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.training_state import put_weights, read_tensors
+
+__all__ = ["TrainedStart", "like_start", "of_training", "read_start"]
+
+FLAG = "--start-from "
+LEARNED = "learned"
+"""Name of the policy that ships."""
+VECTOR_WEIGHT = "model.encoder_env_state_input_proj.weight"
+"""Weight of ACT's layer that reads the vector of task and tracker, a column for each number."""
+
+
+@dataclass(frozen=True)
+class TrainedStart:
+    """A trained policy, without its weights."""
+
+    folder: Path
+    facts: CheckpointFacts
+    stats: dict[str, dict[str, torch.Tensor]]
+    """Statistics of state and action, by which its weights were trained."""
+    digest: str
+    """First 12 hex digits of the SHA-256 of its weights."""
+
+    def check(self, settings: TrainingRecipe) -> TrainingRecipe:
+        """The recipe of a training that begins here: with a vector of tasks where this policy is given one.
+
+        Raises:
+            InputError: Its pictures or actions are others.
+        """
+        facts = self.facts
+        for name, mine, theirs in (
+            ("family", facts.family, settings.family),
+            ("labels", facts.labels, settings.labels),
+            ("pictures", f"{facts.width}x{facts.height}", f"{settings.picture}x{settings.height}"),
+        ):
+            if mine != theirs:
+                raise InputError(f"{FLAG}{self.folder}: has {name} {mine}, this training {theirs}")
+        return dataclasses.replace(settings, use_task_vector=settings.use_task_vector or bool(facts.task_vector))
+
+    def vector(
+        self, tasks: Sequence[str], trackers: Sequence[str], recorded: Collection[str]
+    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Tasks and trackers of the vector: its own, then those that it lacks.
+
+        Args:
+            tasks: Of the datasets; none: the training gives no vector.
+            trackers: That their training would name.
+            recorded: Trackers of the datasets.
+        """
+        own = self.facts
+        if not own.task_vector:
+            return tuple(tasks), tuple(trackers)
+        named = sorted(recorded) if own.tracker_vector else []
+        return _extended(own.task_vector, tasks), _extended(own.tracker_vector, named)
+
+    def put_into(self, model: TrainableModel, tasks: Sequence[str], trackers: Sequence[str]) -> None:
+        """Give a model these weights; what the vector names anew keeps new ones.
+
+        Raises:
+            InputError: They are of another network.
+        """
+        put_weights(model.policy, self.folder / WEIGHTS, lambda held, own: self._widen(held, own, tasks, trackers))
+
+    def _widen(
+        self,
+        held: dict[str, torch.Tensor],
+        own: dict[str, torch.Tensor],
+        tasks: Sequence[str],
+        trackers: Sequence[str],
+    ) -> None:
+        """Fit the layer that reads the vector to a longer one."""
+        before = _numbers(self.facts.task_vector, self.facts.tracker_vector)
+        after = _numbers(tasks, trackers)
+        if before == after:
+            return
+        if VECTOR_WEIGHT not in own or VECTOR_WEIGHT not in held:
+            lacks = ", ".join(number[1] for number in after if number not in before)
+            raise InputError(
+                f"{FLAG}{self.folder}: its vector has no {lacks}, and only an act that has one learns more"
+            )
+        wider = own[VECTOR_WEIGHT].detach().cpu().clone()
+        for column, number in enumerate(before):
+            wider[:, after.index(number)] = held[VECTOR_WEIGHT][:, column].to(wider.dtype)
+        held[VECTOR_WEIGHT] = wider
+
+
+def read_start(named: str) -> TrainedStart:
+    """Read a trained policy.
+
+    Args:
+        named: Folder of a training, of a checkpoint or of `eval pack`; `learned`: the one that ships.
+
+    Raises:
+        InputError: There is none, or a file is damaged.
+    """
+    folder = checkpoint_folder(SHIPPED if named == LEARNED else Path(named).expanduser(), FLAG)
+    checkpoint = read_checkpoint(folder)
+    stats: dict[str, dict[str, torch.Tensor]] = {}
+    for name in PROCESSORS:
+        steps = read_object(folder / name, MOST_JSON)["steps"]
+        assert isinstance(steps, list)  # `read_checkpoint` has looked
+        for step in steps:
+            if step["registry_name"] in NORMALISES and step.get("state_file"):
+                for key, value in read_tensors(folder / step["state_file"]).items():
+                    feature, _, statistic = key.rpartition(".")
+                    if feature in (STATE, ACTION):
+                        stats.setdefault(feature, {})[statistic] = value
+    return TrainedStart(folder, checkpoint.facts, stats, checkpoint.digest)
+
+
+def like_start(options: PolicyTrainOptions, facts: CheckpointFacts, named: Collection[str]) -> PolicyTrainOptions:
+    """Flags of a new training with family, recipe and labels of the policy that it begins with, where none are named.
+
+    Args:
+        facts: Of that policy.
+        named: Fields that were given though they have their default's value.
+    """
+
+    def taken(name: str, its: str) -> str:
+        given, usual = (str(getattr(one, name)) for one in (options, PolicyTrainOptions()))
+        return its if its and given == usual and name not in named else given
+
+    family, recipe = taken("policy", facts.family), taken("recipe", facts.recipe)
+    return dataclasses.replace(options, policy=family, recipe=recipe, labels=taken("labels", facts.labels))
+
+
+def of_training(checkpoint: Path) -> TrainedStart:
+    """The start of a training that goes on: what its checkpoint has kept of it."""
+    return read_start(str(checkpoint / PRETRAINED_MODEL_DIR))
+
+
+def _extended(own: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
+    return (*own, *(name for name in others if name not in own))
+
+
+def _numbers(tasks: Sequence[str], trackers: Sequence[str]) -> list[tuple[str, str]]:
+    """Kind and name that each number of a vector stands for, as `vector_of` has them."""
+    any_other = [("tracker", "")] if trackers else []
+    return [*(("task", name) for name in tasks), *(("tracker", name) for name in trackers), *any_other]
