@@ -78,6 +78,7 @@ def test_rows_differ_by_what_they_are_named_after():
     """Each row differs from its plan's first by what its name says; the rest is the same, and so are the steps."""
     looks = {"looks", "look_changes"}
     rows = {"goals": looks} | dict.fromkeys(("bold", "figures"), looks | {"task_weights"})
+    rows["tuned"] = rows["figures"] | {"start_from", "lr"}
     ablation = {"none": looks | {"recipe_values"}, "augmentation": looks, "untold": {"tracker_vector"}}
     ablation |= dict.fromkeys(("shapes", "light"), {"look_changes"}) | dict.fromkeys(
         ("plain-02", "plain-06"), {"looks"}
