@@ -142,6 +142,7 @@ class DealtRun:
         waiting: dict[Group, list[Episode]],
         shown: Progress,
         besides: Callable[[], int] = lambda: 0,
+        least: int = 1,
     ):
         """Take what is to be played of a run whose folder was prepared.
 
@@ -151,6 +152,7 @@ class DealtRun:
             waiting: Those to play by group.
             shown: What shows how far all is.
             besides: Episodes of other runs that nobody plays yet.
+            least: Episodes that are not divided among processes, where --worlds has room for them.
         """
         self.job, self.folder, self.config, self.journal, self.pool = job, job.folder, job.folder.config, journal, pool
         self.ended, self._besides = ended, besides
@@ -159,7 +161,7 @@ class DealtRun:
         """Episodes to play, by group and by how often they were lost."""
         for group, episodes in waiting.items():
             self._queues[group, 0] = deque(episodes)
-        self._worlds = max(1, min(self.config.flags.worlds, self._fair()))
+        self._worlds = max(1, min(self.config.flags.worlds, max(self._fair(), least)))
         """Worlds of environments, ..."""
         self._most = {group: len(episodes) for group, episodes in waiting.items()}
         """... no more than a group has episodes."""

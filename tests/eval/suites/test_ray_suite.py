@@ -23,7 +23,7 @@ from arena_newton.eval.workers.shard_merge import merge
 ray = pytest.importorskip("ray", reason="needs the extra [ray]")
 from ray.exceptions import ActorDiedError  # noqa: E402
 
-from arena_newton.eval.workers import dealing, local_backend, ray_backend, worker_pool  # noqa: E402
+from arena_newton.eval.workers import batch_player, dealing, local_backend, ray_backend, worker_pool  # noqa: E402
 from arena_newton.eval.workers.actor import EpisodeActor  # noqa: E402
 from arena_newton.eval.workers.backend import WorkerLost  # noqa: E402
 from arena_newton.eval.workers.messages import Done, Node  # noqa: E402
@@ -207,6 +207,26 @@ def test_a_process_stays_in_its_scene(inline, suite, tmp_path):
     cells = ["/".join(folder.split("/")[-4:]) for _, folder in fake.opened]
     order = ("expert/twist2/{}/base", "still/twist2/{}/base", "expert/twist2/{}/semantic")
     assert cells == [name.format(task) for task in ("boxing", "football") for name in order]
+
+
+@pytest.mark.parametrize(("device", "most"), [("cpu", 4), ("NVIDIA H200", 8)])
+def test_a_gpu_plays_a_cell_whole(inline, suite, tmp_path, monkeypatch, device, most):
+    """Cells are divided among processes without a GPU alone; those with the longest episodes begin first."""
+    text = SUITE.replace("worlds = 2", "worlds = 8").replace('["boxing", "football"]', '["football", "boxing"]')
+    suite.write_text(text.partition('[[policies]]\nname = "still"')[0])
+    monkeypatch.setattr(batch_player, "device_name", lambda _: device)
+    dealt, deal = [], dealing.DealtRun.next
+
+    def seen(run, worker):
+        given = deal(run, worker)
+        dealt.append((given.group[0], len(given.left), given.worlds))
+        return given
+
+    monkeypatch.setattr(dealing.DealtRun, "next", seen)
+    inline()
+    assert call(suite, tmp_path / "out", by=("--jobs", "4")) == 0
+    named, counts, worlds = zip(*dealt, strict=True)
+    assert named[0] == "boxing" and (max(counts), max(worlds), sum(counts)) == (most, most, 16)
 
 
 @pytest.mark.parametrize(("every", "by"), [(11, (*RAY, "--ray-attempts", "99")), (11, JOBS)], ids=str)
