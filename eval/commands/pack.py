@@ -76,7 +76,7 @@ def run(checkpoints: Sequence[Path], options: PackOptions) -> int:
     found = (*found, *kept)
     others = _trainings([Path(name).expanduser() for name in options.trainings], facts, digests)
     # Of equally good tasks the first stays the first.
-    trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.task_vector or facts.tasks))))
+    trained = tuple(dict.fromkeys((*(before.tasks if before else ()), *(facts.tasks or facts.task_vector))))
     again = before.tasks if before is not None and not options.results else ()  # nothing new is known of them
     chosen = options.tasks or again or (_solved(found, trained, facts.trackers) if found else trained)
     for task in chosen:

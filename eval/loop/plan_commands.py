@@ -121,7 +121,8 @@ def plan_commands(
     found: list[PlanCommand] = []
     trackers = plan.record.tracker or ("twist2",)
     for task, tracker in itertools.product(plan.attempts, trackers):
-        found += _demonstrations(plan, folders, task, tracker, device)
+        if any(task in row.tasks and tracker in row.trackers for row in rows):
+            found += _demonstrations(plan, folders, task, tracker, device)
     for row in rows:
         datasets = tuple(folders.dataset(*pair) for pair in itertools.product(row.tasks, row.trackers))
         each = max(1, min(plan.settings.gpus, gpus))

@@ -23,7 +23,12 @@ from arena_newton.eval.suites.suite_file import read_suite_file, read_toml
 from arena_newton.files.stored_json import Json, JsonObject, check_types, shown
 from arena_newton.files.text import plain_text
 from arena_newton.policies.recipes.training_recipe import recipe
-from arena_newton.policies.train.policy_options import PolicyTrainOptions, check_numbers
+from arena_newton.policies.train.policy_options import (
+    PolicyTrainOptions,
+    check_numbers,
+    look_fractions,
+    task_weights,
+)
 
 __all__ = ["LoopPlan", "PlanRow", "PlanSettings", "policy_name", "read_plan", "suite_text"]
 
@@ -277,6 +282,12 @@ def _check(plan: LoopPlan) -> None:
             if plan.record.size != f"{picture}x{picture}":
                 taken = f"recipe {row.train.policy}/{row.train.recipe} takes {picture}x{picture}"
                 raise InputError(f"{taken}, and [record] has size {plan.record.size}")
+            for flag, named in (
+                ("task_weights", task_weights(row.train.task_weights)),
+                ("looks", look_fractions(row.train.looks)[1]),
+            ):
+                if other := [task for task in named if task not in row.tasks]:
+                    raise InputError(f"{flag} names {other[0]}, and its tasks are {' '.join(row.tasks)}")
             if bool(row.train.looks) and not plan.record.looks:
                 raise InputError("changes looks, and [record] has no looks")
     except InputError as error:

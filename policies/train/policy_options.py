@@ -16,6 +16,7 @@ from arena_newton.policies.chunk_flags import LABELS
 from arena_newton.policies.recipes.training_recipe import FAMILIES, RECIPES, TrainingRecipe
 
 __all__ = [
+    "LEARNED",
     "PolicyTrainOptions",
     "TeachableOptions",
     "check_choices",
@@ -39,6 +40,9 @@ FLAGGED = {
     "network": "network.<field>=",
 }
 """Fields of a recipe that a flag of their own says, and that flag."""
+
+LEARNED = "learned"
+"""Name of the policy that ships, of `--start-from`."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ class PolicyTrainOptions:
     """Pretrained weights by their name on the hub or a local folder, where the family takes some."""
     start_from: str = ""
     """Begin with the weights of a trained policy of the same network: folder of a training, checkpoint or packed
-    policy, or `learned`, the one that ships. Family, recipe and labels are its own where they are not named."""
+    policy, or `learned`, the one that ships (--recipe compact)."""
     save_every: int = field(default=5000, metadata=bounds(0))
     """Steps between checkpoints; 0: only the last one."""
     keep: int = field(default=2, metadata=bounds(0))
@@ -273,6 +277,8 @@ def check_numbers(options: PolicyTrainOptions) -> None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.start_from and options.weights:
         raise InputError("--weights: are those of --start-from; drop one of them")
+    if options.start_from not in ("", LEARNED) and options.resume is None and not Path(options.start_from).is_dir():
+        raise InputError(f"--start-from {options.start_from}: no such folder, and not {LEARNED}")
     if options.labels not in ("", *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)

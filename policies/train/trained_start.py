@@ -14,18 +14,31 @@ from arena_newton.errors import InputError
 from arena_newton.files.stored_json import read_object
 from arena_newton.policies.learned.learned_card import SHIPPED
 from arena_newton.policies.lerobot.checkpoint_facts import NORMALISES, CheckpointFacts, checkpoint_folder
-from arena_newton.policies.lerobot.checkpoint_reader import PROCESSORS, WEIGHTS, read_checkpoint
+from arena_newton.policies.lerobot.checkpoint_reader import PROCESSORS, WEIGHTS, PolicyCheckpoint, read_checkpoint
 from arena_newton.policies.lerobot.picture_preparation import MOST_JSON
 from arena_newton.policies.recipes.training_recipe import TrainingRecipe
 from arena_newton.policies.train.families.policy_model import ACTION, STATE, TrainableModel
-from arena_newton.policies.train.policy_options import PolicyTrainOptions
+from arena_newton.policies.train.policy_options import LEARNED
 from arena_newton.policies.train.training_state import put_weights, read_tensors
 
-__all__ = ["TrainedStart", "like_start", "of_training", "read_start"]
+__all__ = ["TrainedStart", "of_training", "read_start"]
 
 FLAG = "--start-from "
-LEARNED = "learned"
-"""Name of the policy that ships."""
+OTHER = frozenset(
+    ("input_features", "output_features", "device", "use_amp", "push_to_hub", "repo_id", "private", "tags")
+)
+OTHER |= {
+    "license",
+    "pretrained_path",
+    "pretrained_revision",
+    "pretrained_backbone_weights",
+    "n_action_steps",
+    "dropout",
+}
+OTHER |= {"kl_weight", "gradient_checkpointing", "compile_model", "compile_mode", "num_inference_steps", "dtype"}
+"""Fields of LeRobot's configuration that may differ: they say nothing of what the weights compute."""
+OF_OPTIMIZER = ("optimizer_", "scheduler_")
+"""Beginnings of more of them."""
 VECTOR_WEIGHT = "model.encoder_env_state_input_proj.weight"
 """Weight of ACT's layer that reads the vector of task and tracker, a column for each number."""
 
@@ -34,28 +47,61 @@ VECTOR_WEIGHT = "model.encoder_env_state_input_proj.weight"
 class TrainedStart:
     """A trained policy, without its weights."""
 
-    folder: Path
-    facts: CheckpointFacts
+    checkpoint: PolicyCheckpoint
     stats: dict[str, dict[str, torch.Tensor]]
     """Statistics of state and action, by which its weights were trained."""
-    digest: str
-    """First 12 hex digits of the SHA-256 of its weights."""
 
-    def check(self, settings: TrainingRecipe) -> TrainingRecipe:
-        """The recipe of a training that begins here: with a vector of tasks where this policy is given one.
+    @property
+    def facts(self) -> CheckpointFacts:
+        """Facts that it gives."""
+        return self.checkpoint.facts
+
+    def recipe(self, settings: TrainingRecipe) -> TrainingRecipe:
+        """The recipe of a training that begins here: given tasks where this policy is, without pretrained weights.
 
         Raises:
-            InputError: Its pictures or actions are others.
+            InputError: Family or labels are others, or this policy is given no tasks and the training gives some.
         """
         facts = self.facts
-        for name, mine, theirs in (
-            ("family", facts.family, settings.family),
-            ("labels", facts.labels, settings.labels),
-            ("pictures", f"{facts.width}x{facts.height}", f"{settings.picture}x{settings.height}"),
+        for flag, mine, theirs in (
+            ("--policy", facts.family, settings.family),
+            ("--labels", facts.labels, settings.labels),
         ):
             if mine != theirs:
-                raise InputError(f"{FLAG}{self.folder}: has {name} {mine}, this training {theirs}")
-        return dataclasses.replace(settings, use_task_vector=settings.use_task_vector or bool(facts.task_vector))
+                raise self._unfit(f"is of {flag} {mine}, this training of {theirs}")
+        if settings.use_task_vector and not facts.task_vector:
+            raise self._unfit("is given no vector of tasks, which this training has (--task-vector, or its recipe)")
+        network = {**settings.network}
+        if "pretrained_backbone_weights" in network:
+            network["pretrained_backbone_weights"] = None
+        return dataclasses.replace(settings, network=network, use_task_vector=bool(facts.task_vector))
+
+    def check(self, model: TrainableModel, fit: str) -> None:
+        """Make sure that a model is the same network, and sees pictures as this policy does.
+
+        Args:
+            fit: Of the datasets' pictures, `pad` or `native`.
+
+        Raises:
+            InputError: A field of its configuration differs; the message names it and what this policy has.
+        """
+        mine, theirs = self.checkpoint.config, model.policy.config
+        names = [one.name for one in dataclasses.fields(theirs) if one.name not in OTHER]
+        for name in (one for one in names if not one.startswith(OF_OPTIMIZER)):
+            held, made = (getattr(config, name, None) for config in (mine, theirs))
+            if held != made:
+                text = f"{name} is {held}, in this training {made}"
+                raise self._unfit(
+                    f"{text}; its recipe is {self.facts.recipe or 'not known'} (--recipe, --recipe-values)"
+                )
+        size = f"{model.recipe.picture}x{model.recipe.height}"
+        fit = "native" if model.recipe.cut_pad else fit
+        for camera in self.checkpoint.cameras.values():
+            if self.checkpoint.preparation or (f"{camera.width}x{camera.height}", camera.fit) != (size, fit):
+                raise self._unfit(f"sees {camera.width}x{camera.height} ({camera.fit}), this training {size} ({fit})")
+
+    def _unfit(self, text: str) -> InputError:
+        return InputError(f"{FLAG}{self.checkpoint.folder}: {text}")
 
     def vector(
         self, tasks: Sequence[str], trackers: Sequence[str], recorded: Collection[str]
@@ -79,7 +125,9 @@ class TrainedStart:
         Raises:
             InputError: They are of another network.
         """
-        put_weights(model.policy, self.folder / WEIGHTS, lambda held, own: self._widen(held, own, tasks, trackers))
+        put_weights(
+            model.policy, self.checkpoint.folder / WEIGHTS, lambda held, own: self._widen(held, own, tasks, trackers)
+        )
 
     def _widen(
         self,
@@ -96,7 +144,7 @@ class TrainedStart:
         if VECTOR_WEIGHT not in own or VECTOR_WEIGHT not in held:
             lacks = ", ".join(number[1] for number in after if number not in before)
             raise InputError(
-                f"{FLAG}{self.folder}: its vector has no {lacks}, and only an act that has one learns more"
+                f"{FLAG}{self.checkpoint.folder}: its vector has no {lacks}, and only an act that has one learns more"
             )
         wider = own[VECTOR_WEIGHT].detach().cpu().clone()
         for column, number in enumerate(before):
@@ -125,23 +173,7 @@ def read_start(named: str) -> TrainedStart:
                     feature, _, statistic = key.rpartition(".")
                     if feature in (STATE, ACTION):
                         stats.setdefault(feature, {})[statistic] = value
-    return TrainedStart(folder, checkpoint.facts, stats, checkpoint.digest)
-
-
-def like_start(options: PolicyTrainOptions, facts: CheckpointFacts, named: Collection[str]) -> PolicyTrainOptions:
-    """Flags of a new training with family, recipe and labels of the policy that it begins with, where none are named.
-
-    Args:
-        facts: Of that policy.
-        named: Fields that were given though they have their default's value.
-    """
-
-    def taken(name: str, its: str) -> str:
-        given, usual = (str(getattr(one, name)) for one in (options, PolicyTrainOptions()))
-        return its if its and given == usual and name not in named else given
-
-    family, recipe = taken("policy", facts.family), taken("recipe", facts.recipe)
-    return dataclasses.replace(options, policy=family, recipe=recipe, labels=taken("labels", facts.labels))
+    return TrainedStart(checkpoint, stats)
 
 
 def of_training(checkpoint: Path) -> TrainedStart:

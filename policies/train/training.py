@@ -38,7 +38,7 @@ from arena_newton.policies.train.policy_options import (
 )
 from arena_newton.policies.train.policy_trainer import PolicyTrainer
 from arena_newton.policies.train.stored_flags import plain, plain_options, resumed, stored_recipe
-from arena_newton.policies.train.trained_start import TrainedStart, like_start, of_training, read_start
+from arena_newton.policies.train.trained_start import TrainedStart, of_training, read_start
 from arena_newton.policies.train.training_loop import Processes, TrainingLoop
 from arena_newton.policies.train.training_state import TrainingProgress, check_new, last_checkpoint, restore
 
@@ -54,7 +54,7 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     Args:
         options: Flags. With `resume` those of the interrupted training hold; of those that may differ, what is not
             at its default is taken.
-        named: Fields that were given, which count though they are at their default.
+        named: With `resume`, fields that count though they are at their default.
 
     Returns:
         Folder of the last checkpoint, which `--policy lerobot:` and LeRobot load.
@@ -80,14 +80,15 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
                 print(f"finished already, after {counted(progress.step, 'step')}: {checkpoint / PRETRAINED_MODEL_DIR}")
             return checkpoint / PRETRAINED_MODEL_DIR
     start: TrainedStart | None = None
-    if options.start_from and checkpoint is None:
-        start = read_start(options.start_from)
-        options = like_start(options, start.facts, named)
-    elif options.start_from and checkpoint is not None:
-        start = of_training(checkpoint)
+    if options.start_from:
+        start = read_start(options.start_from) if checkpoint is None else of_training(checkpoint)
     settings = chosen_recipe(options) if checkpoint is None else stored_recipe(checkpoint)
     if start is not None:
-        settings = start.check(settings)
+        settings = start.recipe(settings)
+        if start.facts.tracker_vector and not options.tracker_vector:
+            raise InputError(
+                f"--no-tracker-vector: {start.checkpoint.folder}, which it begins with, is given its tracker"
+            )
     out = options.out or default_folder(options)
     if options.resume is None:
         check_new(out)
@@ -171,9 +172,10 @@ def _train(
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
     if start is not None:
+        start.check(model, camera_fit(store))
         start.put_into(model, vector, trackers)
         if speaks:
-            print(f"begins with the weights of {start.folder} ({start.digest})", flush=True)
+            print(f"begins with the weights of {start.checkpoint.folder} ({start.checkpoint.digest})", flush=True)
     batches = make_batches(model, store, vector, trackers)
     trainer = PolicyTrainer(
         model,
@@ -202,7 +204,11 @@ def _train(
         tasks=tuple(task for task in store.tasks if task),
         trackers=tuple(sorted({tracker for dataset in datasets for tracker in dataset.trackers})),
         seed=settings.seed,
-        started_from="" if start is None else start.facts.started_from if progress is not None else start.digest,
+        started_from=""
+        if start is None
+        else start.facts.started_from
+        if progress is not None
+        else start.checkpoint.digest,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         processes=processes.count,
         datasets=tuple(dataset.described for dataset in datasets),

@@ -224,6 +224,9 @@ def put_weights(
     for names, words in ((missing, "lacks"), (unknown, "has unknown"), (unlike, "has another shape of")):
         if names:
             raise InputError(f"{path}: {words} {names[0]}")
+    for name, tensor in weights.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise InputError(f"{path}: {name} has numbers that are not finite")
     with torch.no_grad():
         for name, tensor in weights.items():
             own[name].copy_(tensor)

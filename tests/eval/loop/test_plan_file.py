@@ -60,6 +60,10 @@ def test_a_row_of_one_task_and_tracker_has_its_demonstrations_alone(tmp_path):
     training = commands["train boxing-sonic_1"]
     words = training.words()
     assert training.after == ("build boxing_sonic",)
+    assert [name for name in commands if name.startswith(("record", "build"))] == [
+        "record boxing_sonic",
+        "build boxing_sonic",
+    ]
     assert words[words.index("--dataset") + 1 : words.index("--recipe")] == [str(tmp_path / "datasets/boxing_sonic")]
     assert commands_at_once(plan, 1) == {"record": 18, "build": 8, "train": 4, "evaluate": 7}
     card = commands["card boxing-sonic"].words()
@@ -194,6 +198,13 @@ BAD = [
     ('name = "own"', 'name = "all"', "[[rows]] all: expected a name of its own"),
     ('trackers = ["twist2"]', 'trackers = ["pd"]', "[[rows]] own: trackers are pd, known are twist2 sonic"),
     ('trackers = ["twist2"]', 'tasks = ["chess"]', "[[rows]] own: tasks are chess, known are boxing vis_navi"),
+    (
+        'balance = "task"',
+        'balance = "task"\ntask_weights = ["chess=2"]',
+        "[[rows]] all: task_weights names chess, and its",
+    ),
+    ('looks = ["0.5"]', 'looks = ["0.5", "football=0.1"]', "[[rows]] all: looks names football, and its tasks are "),
+    ('recipe = "small"', 'recipe = "small"\nstart_from = "/nowhere"', "[[rows]] all: --start-from /nowhere: no such"),
     ("repeats = 2", "repeats = 0", "[evaluate]: [defaults]: --repeats 0"),
     ("repeats = 2", "chunks = 2", "[evaluate]: [defaults]: chunks is unknown"),
     ("seeds = [1, 2]", "seeds = [1, 1]", "[plan]: seeds are 1 1, expected each once"),
