@@ -243,7 +243,7 @@ def _rows(path: Path, content: Mapping[str, Json], all_: Mapping[str, Sequence[J
         mine = {key: _names(table.get(key, list(known))) for key, known in all_.items()}
         for key, known in all_.items():
             if not mine[key] or not all(value in known for value in mine[key]):
-                given, names = (" ".join(map(str, values)) for values in (mine[key], known))
+                given, names = (" ".join(map(str, values)) or "none" for values in (mine[key], known))
                 raise InputError(f"{where}: {key} are {given}, known are {names}")
         rows.append(PlanRow(name, options, **mine))
     return tuple(rows)

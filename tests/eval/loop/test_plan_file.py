@@ -197,6 +197,7 @@ BAD = [
     ('balance = "task"', 'balance = "all"', "[[rows]] all: --balance all: unknown"),
     ('name = "own"', 'name = "all"', "[[rows]] all: expected a name of its own"),
     ('trackers = ["twist2"]', 'trackers = ["pd"]', "[[rows]] own: trackers are pd, known are twist2 sonic"),
+    ('trackers = ["twist2"]', "tasks = []", "[[rows]] own: tasks are none, known are boxing vis_navi"),
     ('trackers = ["twist2"]', 'tasks = ["chess"]', "[[rows]] own: tasks are chess, known are boxing vis_navi"),
     (
         'balance = "task"',
