@@ -27,7 +27,7 @@ FLAG = "--start-from "
 OTHER = frozenset(
     """input_features output_features device use_amp push_to_hub repo_id private tags license pretrained_path
     pretrained_revision pretrained_backbone_weights n_action_steps dropout kl_weight gradient_checkpointing
-    compile_model compile_mode num_inference_steps dtype""".split()
+    compile_model compile_mode num_inference_steps dtype vision_encoder_name text_encoder_name""".split()
 )
 """Fields of LeRobot's configuration that may differ: they say nothing of what the weights compute."""
 OF_OPTIMIZER = ("optimizer_", "scheduler_")

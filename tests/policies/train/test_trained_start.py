@@ -64,7 +64,9 @@ def begun(dataset, out, start, **changes):
 
 def learned(tensors):
     """Those without the statistics of batches, which follow the data."""
-    return {name: tensor for name, tensor in tensors.items() if "running_" not in name}
+    return {
+        name: tensor for name, tensor in tensors.items() if not name.split(".")[-1].startswith(("running_", "num_"))
+    }
 
 
 def test_a_training_begins_with_the_weights_and_numbers_of_a_policy(trained, sofa, tmp_path):
@@ -155,6 +157,18 @@ def test_an_unfit_start_is_one_error(trained, dataset, sofa, tmp_path, capsys, f
     assert main([*words, *out, "--out", str(tmp_path / "out")]) == 2
     assert says in capsys.readouterr().err
     assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("family", ["diffusion", "flow"])
+def test_other_families_begin_with_a_policy_of_their_own(dataset, tmp_path, family):
+    """All their weights are the policy's."""
+    flags = given(dataset, tmp_path / "first", policy=family, steps=1)
+    train(PolicyTrainOptions(**flags))
+    before = learned(weights(tmp_path / "first"))
+    after = learned(begun(dataset, tmp_path / "out", tmp_path / "first", policy=family))
+    assert before.keys() == after.keys()
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=0.0, atol=1e-6)
 
 
 def test_pictures_must_be_framed_alike(trained, tmp_path):
