@@ -47,7 +47,7 @@ class LoopOptions:
     """Pretrained weights for the training: a name on the hub or a local folder."""
     plan: str | None = None
     """Play a plan instead: a TOML file of sets, rows of trainings, seeds and suites, or the name of one that comes with
-    the package: ablation generalist tiny wrists (docs/howto/train/loop.md)."""
+    the package: ablation generalist singles tiny wrists (docs/howto/train/loop.md)."""
     rows: Several[str] = ()
     """With --plan: rows that are trained and played; the first one when none is named."""
     seeds: Several[int] = ()

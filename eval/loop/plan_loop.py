@@ -117,8 +117,12 @@ def _trainings_at_once(plan: LoopPlan, gpus: int) -> int:
 def commands_at_once(plan: LoopPlan, gpus: int) -> dict[str, int]:
     """Commands of each stage at once."""
     settings = plan.settings
-    most = {"record": settings.recordings, "build": settings.datasets, "evaluate": settings.suites}
-    return most | {"train": _trainings_at_once(plan, gpus)}
+    return {
+        "record": settings.recordings,
+        "build": settings.datasets,
+        "train": _trainings_at_once(plan, gpus),
+        "evaluate": settings.suites,
+    }
 
 
 def _is_this(out: Path, plan: LoopPlan) -> None:

@@ -68,8 +68,6 @@ class _Cell:
     """Not yet in its journal."""
     ticks: int
     """Their step budgets [ticks]."""
-    longest: int
-    """Step budget of an episode [ticks]: those that may take longest begin first."""
     job: Job
     opening: bool = False
     """True if a process opens it that has not been opened before."""
@@ -127,8 +125,7 @@ class _PoolPlayer(CellPlayer):
         left = [max(cell.episodes - self.folder.counts(cell.id)["finished"], 1) for cell in cells]
         ticks = sum(cell.ticks * few // cell.episodes for cell, few in zip(cells, left, strict=True))
         env = cells[0].task, cells[0].tracker, self.scene(names[0])
-        longest = cells[0].ticks // cells[0].episodes
-        return _Cell(names, number, env, sum(left), ticks, longest, Job(self.results_of(names)))
+        return _Cell(names, number, env, sum(left), ticks, Job(self.results_of(names)))
 
     def _play(self) -> None:
         """Play until nothing is left."""
@@ -154,7 +151,7 @@ class _PoolPlayer(CellPlayer):
 
         def order(cell: _Cell) -> tuple[bool, bool, bool, bool, int, int]:
             new = cell.job is not worker.job, cell.env != there, cell.dealt is None, cell.env in busy
-            return *new, -cell.longest, cell.number
+            return *new, -(cell.ticks // cell.episodes), cell.number  # those that may take longest begin first
 
         found = min(filter(wanted, self.cells), key=order, default=None)
         if found is None:

@@ -277,8 +277,9 @@ def check_numbers(options: PolicyTrainOptions) -> None:
         raise InputError("--steps: is given by --minutes too; drop one of them")
     if options.start_from and options.weights:
         raise InputError("--weights: are those of --start-from; drop one of them")
-    if options.start_from not in ("", LEARNED) and options.resume is None and not Path(options.start_from).is_dir():
-        raise InputError(f"--start-from {options.start_from}: no such folder, and not {LEARNED}")
+    start = options.start_from if options.resume is None else ""
+    if start not in ("", LEARNED) and not Path(start).expanduser().is_dir():
+        raise InputError(f"--start-from {start}: no such folder, and not {LEARNED}")
     if options.labels not in ("", *LABELS):
         raise InputError(f"--labels {options.labels}: unknown, choose from {', '.join(LABELS)}")
     look_fractions(options.looks)

@@ -43,6 +43,8 @@ class TrainedStart:
     checkpoint: PolicyCheckpoint
     stats: dict[str, dict[str, torch.Tensor]]
     """Statistics of state and action, by which its weights were trained."""
+    digest: str
+    """First 12 hex digits of the SHA-256 of the weights that a training began with here."""
 
     @property
     def facts(self) -> CheckpointFacts:
@@ -136,9 +138,7 @@ class TrainedStart:
             return
         if VECTOR_WEIGHT not in own or VECTOR_WEIGHT not in held:
             lacks = ", ".join(number[1] for number in after if number not in before)
-            raise InputError(
-                f"{FLAG}{self.checkpoint.folder}: its vector has no {lacks}, and only an act that has one learns more"
-            )
+            raise self._unfit(f"its vector has no {lacks}, and only an act that has one learns more")
         wider = own[VECTOR_WEIGHT].detach().cpu().clone()
         for column, number in enumerate(before):
             wider[:, after.index(number)] = held[VECTOR_WEIGHT][:, column].to(wider.dtype)
@@ -166,12 +166,13 @@ def read_start(named: str) -> TrainedStart:
                     feature, _, statistic = key.rpartition(".")
                     if feature in (STATE, ACTION):
                         stats.setdefault(feature, {})[statistic] = value
-    return TrainedStart(checkpoint, stats)
+    return TrainedStart(checkpoint, stats, checkpoint.digest)
 
 
 def of_training(checkpoint: Path) -> TrainedStart:
     """The start of a training that goes on: what its checkpoint has kept of it."""
-    return read_start(str(checkpoint / PRETRAINED_MODEL_DIR))
+    kept = read_start(str(checkpoint / PRETRAINED_MODEL_DIR))
+    return dataclasses.replace(kept, digest=kept.facts.started_from)
 
 
 def _extended(own: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:

@@ -80,10 +80,11 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
                 print(f"finished already, after {counted(progress.step, 'step')}: {checkpoint / PRETRAINED_MODEL_DIR}")
             return checkpoint / PRETRAINED_MODEL_DIR
     start: TrainedStart | None = None
-    if options.start_from:
-        start = read_start(options.start_from) if checkpoint is None else of_training(checkpoint)
     settings = chosen_recipe(options) if checkpoint is None else stored_recipe(checkpoint)
-    if start is not None:
+    if options.start_from and checkpoint is not None:
+        start = of_training(checkpoint)
+    elif options.start_from:
+        start = read_start(options.start_from)
         settings = start.recipe(settings)
         if start.facts.tracker_vector and not options.tracker_vector:
             raise InputError(
@@ -171,11 +172,11 @@ def _train(
         stats[VECTOR_KEY] = {"mean": zeros, "std": ones, "min": zeros, "max": ones, "q01": zeros, "q99": ones}
     torch.manual_seed(settings.seed)
     model = families.build(settings, stats, device, options.weights or None)
-    if start is not None:
+    if start is not None and checkpoint is None:
         start.check(model, camera_fit(store))
         start.put_into(model, vector, trackers)
         if speaks:
-            print(f"begins with the weights of {start.checkpoint.folder} ({start.checkpoint.digest})", flush=True)
+            print(f"begins with the weights of {start.checkpoint.folder} ({start.digest})", flush=True)
     batches = make_batches(model, store, vector, trackers)
     trainer = PolicyTrainer(
         model,
@@ -204,11 +205,7 @@ def _train(
         tasks=tuple(task for task in store.tasks if task),
         trackers=tuple(sorted({tracker for dataset in datasets for tracker in dataset.trackers})),
         seed=settings.seed,
-        started_from=""
-        if start is None
-        else start.facts.started_from
-        if progress is not None
-        else start.checkpoint.digest,
+        started_from="" if start is None else start.digest,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         processes=processes.count,
         datasets=tuple(dataset.described for dataset in datasets),

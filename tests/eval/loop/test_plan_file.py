@@ -97,9 +97,15 @@ def test_rows_differ_by_what_they_are_named_after():
 
 
 def test_the_ablation_has_the_demonstrations_and_the_recipe_of_the_generalist():
-    """Its first row is the generalist's, with fewer steps of half as many samples on one GPU."""
+    """Its first row is the generalist's, with fewer steps of half as many samples; singles has the demonstrations."""
     ablation, plan = read_plan("ablation"), read_plan("generalist")
     assert (ablation.record, ablation.attempts, ablation.parts) == (plan.record, plan.attempts, plan.parts)
+    singles = read_plan("singles")
+    assert (replace(singles.record, looks=1), singles.attempts, singles.parts) == (
+        plan.record,
+        plan.attempts,
+        plan.parts,
+    )
     mine, theirs = (vars(one.rows[0].train) for one in (ablation, plan))
     assert {key for key in mine if mine[key] != theirs[key]} == {"steps", "lr", "hold_out_every"}
 

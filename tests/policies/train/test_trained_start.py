@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,12 +101,13 @@ def test_it_answers_as_the_policy_did(trained, dataset, tmp_path):
     torch.testing.assert_close(found[0], found[1], rtol=0.0, atol=1e-5)
 
 
-def test_it_goes_on_without_the_policy(trained, sofa, tmp_path):
+def test_it_goes_on_without_the_policy(trained, sofa, tmp_path, monkeypatch):
     """A stopped training needs neither the policy's folder nor its flags, and still says what it began with."""
+    monkeypatch.setenv("HOME", str(tmp_path))
     start, out = tmp_path / "start", tmp_path / "out"
     shutil.copytree(trained, start, symlinks=True)
     digest = read_start(str(start)).checkpoint.digest
-    begun(sofa, out, start)
+    begun(sofa, out, "~/start")
     shutil.rmtree(start)
     assert main(["--resume", str(out), "--steps", "3", "--quiet"]) == 0
     facts = CheckpointFacts.read(checkpoint_folder(out))
@@ -182,9 +184,9 @@ def test_pictures_must_be_framed_alike(trained, tmp_path):
 
 
 def test_a_network_without_a_vector_learns_no_further_task(trained, tmp_path):
-    """Where the vector cannot be made longer, the error names what it lacks."""
+    """The error names what its vector lacks and cannot be given."""
     start = read_start(str(trained))
     facts = replace(start.facts, task_vector=("boxing", "chess"))
     other = replace(start, checkpoint=replace(start.checkpoint, facts=facts))
     with pytest.raises(InputError, match="its vector has no sit_sofa"):
-        other._widen({}, {}, ("boxing", "chess", "sit_sofa"), ())
+        other.put_into(SimpleNamespace(policy=torch.nn.Identity()), ("boxing", "chess", "sit_sofa"), ())
