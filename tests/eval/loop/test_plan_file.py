@@ -44,7 +44,7 @@ def test_the_generalist_plays_every_cell(tmp_path):
     cells = cells_of(read_plan("singles"), "boxing-sonic", tmp_path)
     assert {(cell.task, cell.tracker, cell.mode) for cell in cells} == {
         ("boxing", "twist2", "base"),
-        *(("boxing", "sonic", mode) for mode in ("base", "execution", "dynamics")),
+        *(("boxing", "sonic", mode) for mode in ("base", "execution", "visual", "semantic", "dynamics")),
     }
     swapped = [cell for cell in cells_of(read_plan("tiny"), "own", tmp_path) if cell.tracker not in cell.trained_on]
     assert {cell.mode for cell in swapped} == {"base"}
