@@ -13,7 +13,7 @@ from arena_newton.errors import InputError
 from arena_newton.files.stored_json import is_name
 from arena_newton.interfaces import EpisodeResult, Recorder, World
 
-__all__ = ["Metric", "check", "check_names", "finish", "get", "names", "register", "unregister"]
+__all__ = ["Metric", "check_names", "finish", "get", "load", "names", "register", "unregister"]
 
 Fold = Literal["highest", "lowest", "mean", "total", "last"]
 FOLDS = get_args(Fold)
@@ -21,7 +21,7 @@ FOLDS = get_args(Fold)
 
 RECORDERS: Registry[Recorder] = Registry("recorder", "arena_newton.recorders", lambda: Recorder, {})
 """Makers of recorders, such as their classes; each takes the environment."""
-check = RECORDERS.check
+load = RECORDERS.load
 names = RECORDERS.names
 register = RECORDERS.register
 unregister = RECORDERS.unregister

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from arena_newton.cli.command_line import exit_code, program
+from arena_newton.cli.flags import check_number
 from arena_newton.cli.quiet import quiet_warp
 from arena_newton.errors import InputError
 
@@ -30,6 +32,8 @@ __all__ = ["Entry", "main"]
 PROG = program("trackers evaluate", "arena_newton.trackers.evaluate")
 ROLLOUTS = {"full": 64, "quick": 8, "push": 16}
 """Rollouts per cell, unless --rollouts says otherwise."""
+BOUNDS = {"rollouts": (1, 4096), "goals": (0, 4096), "threads": (1, 1024), "seed": (0, math.inf)}
+"""Flag → least and largest number: all rollouts of a cell are worlds of one batch."""
 
 
 @dataclass
@@ -132,10 +136,9 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
 
 
 def _check(args: argparse.Namespace) -> int:
-    for name, least in {"rollouts": 1, "goals": 0, "threads": 1, "seed": 0}.items():
-        value = getattr(args, name)
-        if value is not None and value < least:
-            raise InputError(f"--{name} {value}: must be at least {least}")
+    for name, bounds in BOUNDS.items():
+        if (value := getattr(args, name)) is not None:
+            check_number(f"--{name}", value, *bounds)
     if args.film and args.out is None:
         raise InputError("--film: name a folder with --out")
     return args.rollouts or ROLLOUTS[args.suite]

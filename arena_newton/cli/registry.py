@@ -86,6 +86,15 @@ class Registry[T]:
                 f"--{self.noun} {name}: offered by {' and by '.join(offers)}; uninstall or rename all but one"
             )
 
+    def load(self, name: str) -> Callable[..., T] | T:
+        """Find the maker of a name, or what is offered as it is.
+
+        Raises:
+            InputError: Unknown or doubled name, or a package that does not load.
+        """
+        self.check(name)
+        return self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
+
     def make(self, name: str, *arguments: Any, **options: Any) -> T:
         """Make one by name.
 
@@ -93,8 +102,7 @@ class Registry[T]:
             InputError: Unknown or doubled name, a package that does not load, a maker that does not fit, or another
                 name than that of what it makes, where they are `named`.
         """
-        self.check(name)
-        factory = self._registered.get(name) or (self._own if name in self.built_in else self._loaded)(name)
+        factory = self.load(name)
         if isinstance(factory, self.base()):
             return self._known_as(name, factory)
         if not callable(factory):

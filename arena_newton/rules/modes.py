@@ -107,7 +107,7 @@ class Mode:
             if (
                 not (low <= high and all(map(math.isfinite, bounds)))
                 or (low < 0.0 and not signed)
-                or (low == 0.0 and name in ("robot_mass", "object_mass"))
+                or (low == 0.0 and name in ("friction", "robot_mass", "object_mass"))
                 or (high > 1.0 and name == "push_time")
                 or (whole and not all(bound.is_integer() for bound in bounds))
             ):
@@ -233,7 +233,8 @@ def _with(mode: Mode, name: str, added: list[str]) -> Mode:
     for text in added:
         found = _ADDED.fullmatch(text)
         if not found:
-            raise InputError(f"--mode {name}: {text!r}: expected a quantity and its value or range, as push=0.5{TO}1")
+            wanted = f"expected a quantity and its value or range, as push=0.5{TO}1, without an exponent"
+            raise InputError(f"--mode {name}: {text!r}: {wanted}")
         quantity, low, high = found.groups()
         given[quantity] = float(low), float(low if high is None else high)
     if "push" in given:

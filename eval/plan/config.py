@@ -314,7 +314,7 @@ def resolve(options: RunOptions) -> RunConfig:
     policies.check_spec(options.policy)
     check_once("--recorder", options.recorder)
     for recorder in options.recorder:
-        recorders.check(recorder)
+        recorders.load(recorder)
     if scheme in POLICY_PATH_SCHEMES and target and not (scheme == "lerobot" and hub_name(target)):
         at, episode = dataset_target(str(Path(target).expanduser()))
         policy_path, ending = _existing("--policy", str(at), f"{scheme}:"), "" if episode is None else f"#{episode}"

@@ -196,7 +196,7 @@ def contradiction(record: EpisodeRecord) -> str | None:
         return "a fall without the event fall"
     if not record.steps and record.outcome != "error" and not record.startup_fall:
         return f"a {record.outcome} at step 0, before the policy's first action"
-    if record.outcome != "fall" and fell is not None and fell < record.steps:
+    if record.outcome != "fall" and fell is not None and max(fell, 0) < record.steps:  # a start-up has no steps
         return f"a {record.outcome} at step {record.steps} after a fall at {fell}"
     return None
 

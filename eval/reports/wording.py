@@ -97,7 +97,7 @@ def tasks_of(config: Identity, records: Sequence[EpisodeRecord]) -> list[str]:
 
 def rules_that_ran(rule_set: Mapping[str, str], tasks: Sequence[str]) -> list[tuple[str, str]]:
     """The rows of a rule set that speak of the tasks of a run, or of all tasks."""
-    known = {name: specs.get(name) for name in specs.names()}
+    known = {spec.name: spec for spec in specs.specs()}
     owners = {item: name for name, spec in known.items() for item, _ in spec.rules.paper.success.notes()}
     records = {name: {o.record for o in spec.objects} for name, spec in known.items()}
     ours = set(tasks) & set(known)

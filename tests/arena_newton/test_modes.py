@@ -97,6 +97,7 @@ def test_a_mode_of_another_package_brings_layers(monkeypatch, tmp_path):
         ({"dynamics": {"action_latency": (0.5, 2)}}, "mode wet: action_latency: 0.5 to 2 is not a range of it"),
         ({"dynamics": {"friction": (0.5, float("inf"))}}, "mode wet: friction: 0.5 to inf is not a range of it"),
         ({"dynamics": {"object_mass": (0.0, 1.0)}}, "mode wet: object_mass: 0 to 1 is not a range of it"),
+        ({"dynamics": {"friction": (0.0, 1.0)}}, "mode wet: friction: 0 to 1 is not a range of it"),
         ({"dynamics": {"push_time": (0.5, 1.5)}}, "mode wet: push_time: 0.5 to 1.5 is not a range of it"),
         ({"dynamics": {"state_latency": (0, 11)}}, "mode wet: state_latency: 11, expected at most 10 ticks"),
         ({"scene": "layers"}, "mode wet: scene is 'layers', expected base, semantic or layer"),

@@ -191,22 +191,27 @@ BROKEN = {
     "renamed": ("arena_newton.tasks.boxing:TASK", "--task renamed: its package calls it boxing"),
 }
 """Entry point → what it names, and what is said of it."""
+RECORDER = "[arena_newton.recorders]\ngone = nowhere.at_all:Recorder\n"
 
 
 def test_a_package_that_does_not_load_disturbs_no_other_task(tmp_path, monkeypatch):
-    """A task that its package fails to give is refused by name; lists and rule sets have all others."""
+    """What a package fails to give is refused by name before a run; lists, rule sets and runs have all others."""
     rules, known = rule_sets.get("paper").hash, tasks.names()
     info = tmp_path / "broken-1.0.dist-info"
     info.mkdir()
     info.joinpath("METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     lines = [f"{name} = {target}\n" for name, (target, _) in BROKEN.items()]
-    info.joinpath("entry_points.txt").write_text("[arena_newton.tasks]\n" + "".join(lines))
+    info.joinpath("entry_points.txt").write_text("[arena_newton.tasks]\n" + "".join(lines) + RECORDER)
     monkeypatch.syspath_prepend(tmp_path)
     assert {*tasks.names()} == {*known, *BROKEN} and tuple(spec.name for spec in tasks.specs()) == known
     assert rule_sets.get("paper").hash == rules
     for name, (_, said) in BROKEN.items():
         with pytest.raises(InputError, match=said):
             tasks.get(name)
+    flags = "--policy stand --tracker pd --engine mujoco --seeds 0 --repeats 1 --max-steps 2 --out".split()
+    assert eval_main(["run", "--task", "boxing", *flags, str(tmp_path / "run")]) == 0
+    assert eval_main(["run", "--task", "boxing", "--recorder", "gone", *flags, str(tmp_path / "none")]) == 2
+    assert not (tmp_path / "none").exists()
     found = [finding.value for finding in _scenes() if finding.status == "bad"]
     assert len(found) == len(BROKEN) and all(text.startswith("--task ") for text in found)
 

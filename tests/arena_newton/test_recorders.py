@@ -53,7 +53,7 @@ def test_recorders_are_known_by_name():
     finally:
         recorders.unregister("blind")
     with pytest.raises(InputError, match="--recorder blind: unknown recorder"):
-        recorders.check("blind")
+        recorders.load("blind")
 
 
 @pytest.mark.parametrize(

@@ -429,6 +429,7 @@ def test_without_matplotlib_nothing_is_drawn(tmp_path, monkeypatch):
         (["--tracker", "pd", "--only", "nothing"], "no cell or group matches"),
         (["--tracker", "pd", "--only", "stand", "nothing"], "--only nothing: no cell or group matches"),
         (["--tracker", "pd", "--rollouts", "0"], "--rollouts 0"),
+        (["--tracker", "pd", "--rollouts", "999999999"], "--rollouts 999999999: expected a number from 1 to 4096"),
         (["--tracker", "pd", "--clips", "absent.pkl"], "absent.pkl"),
         (["--tracker", "pd", "--film"], "--out"),
         (["--tracker", "pd", "--device", "cuda:99"], "cuda"),

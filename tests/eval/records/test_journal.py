@@ -178,6 +178,13 @@ def test_unfit_record_is_named(tmp_path, key, value, message):
         read_journal(path)
 
 
+def test_a_fall_contradicts_steps_after_it_and_no_error_of_the_start_up():
+    """A start-up whose state ends non-finite may fall in that tick; an episode that went on after a fall was edited."""
+    fell = {"events": [{"kind": "fall", "tick": -46, "detail": "tilt"}], "outcome": "error"}
+    assert module.contradiction(rows.record(ROWS[0] | fell | {"steps": 0})) is None
+    assert "at step 5 after a fall at -46" in module.contradiction(rows.record(ROWS[0] | fell | {"steps": 5}))
+
+
 def test_nan_never_enters(tmp_path):
     """The journal is strict JSON: NaN is an error of the caller, not a line."""
     path = tmp_path / "episodes.jsonl"
