@@ -94,6 +94,8 @@ class ArenaEnv:
         """
         if worlds < 1:
             raise InputError(f"--worlds {worlds}: must be at least 1")
+        if isinstance(tracker, str):
+            raise InputError(f"tracker {tracker!r}: is a name, expected what arena_newton.trackers.get makes of it")
         self.spec = tasks.get(task)
         own_layer = self.spec.own_layer(mode)
         if own_layer and variant_file:

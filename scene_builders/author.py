@@ -10,6 +10,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
+from arena_newton.errors import InputError
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY
 from arena_newton.usd_scenes.dependencies import PACKAGE, search_context
 
@@ -47,8 +48,15 @@ def asset(stage: Usd.Stage, path: str) -> str:
 
 
 def look_at(eye: Vec, point: Vec) -> tuple[float, float, float, float]:
-    """Orientation of a camera at `eye` [m] that looks at a point [m] with its upper edge up; wxyz."""
-    z = np.subtract(eye, point) / np.linalg.norm(np.subtract(eye, point))
+    """Orientation of a camera at `eye` [m] that looks at a point [m] with its upper edge up; wxyz.
+
+    Raises:
+        InputError: The two are the same point, or one is not finite.
+    """
+    z = np.subtract(eye, point)
+    if not 1e-9 < (far := float(np.linalg.norm(z))) < np.inf:
+        raise InputError(f"look_at: from {eye} to {point} there is no direction, expected two finite points apart")
+    z = z / far
     x = np.cross((0.0, 0.0, 1.0), z)
     x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
     quat = Gf.Matrix3d(*map(float, np.concatenate([x, np.cross(z, x), z]))).ExtractRotation().GetQuat()

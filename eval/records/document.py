@@ -165,7 +165,8 @@ def read_document(folder: Path) -> Document:
     fit(where, document, Document)
     for task in document["gym_ids"]:
         if task not in tasks.names():
-            raise InputError(f"{path}: gym_ids: task is {shown(task)}, known are {' '.join(tasks.names())}")
+            known = f"this package and those installed beside it have {' '.join(tasks.names())}"
+            raise InputError(f"{path}: gym_ids: task {shown(task)} is unknown, {known}")
     return document  # type: ignore[return-value]  # what `fit` has tested
 
 

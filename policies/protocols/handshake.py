@@ -158,19 +158,19 @@ def read_facts(content: object, where: str) -> ServedFacts:
         WireError: The record is damaged or of a later version.
     """
     if not isinstance(content, Mapping):
-        raise WireError(f"{where}: the server's metadata is {type(content).__name__}, expected a map")
+        raise WireError(f"{where}: its metadata is {type(content).__name__}, expected a map")
     if "arena" not in content:
         return ServedFacts()
     if content["arena"] != HANDSHAKE_VERSION or isinstance(content["arena"], bool):
         version = plain_text(content["arena"], 40)
-        raise WireError(f"{where}: the server's handshake has version {version}, expected {HANDSHAKE_VERSION}")
+        raise WireError(f"{where}: its handshake has version {version}, expected {HANDSHAKE_VERSION}")
     declared = {key: value for key, value in content.items() if value is not None}
     if "picture" in declared:
         declared["picture"] = _known(declared["picture"])
     if isinstance(cameras := declared.get("cameras"), Mapping):
         declared["cameras"] = {name: _known(one) for name, one in cameras.items()}
     try:
-        facts = loaded(f"{where}: the server declares", declared, ServedFacts)
+        facts = loaded(f"{where}: it declares", declared, ServedFacts)
     except InputError as error:
         raise WireError(str(error)) from None
     realign, rate = (None if number is None else float(number) for number in (facts.realign, facts.rate_hz))

@@ -34,6 +34,12 @@ def test_settle_ticks_precede_step_zero(env):
     assert (env.tick == -env.startup_ticks).all()
 
 
+def test_a_tracker_is_no_name():
+    """A name instead of a tracker is refused before a scene is built, with what makes one of it."""
+    with pytest.raises(InputError, match=r"tracker 'twist2': is a name, expected what arena_newton.trackers.get"):
+        ArenaEnv("boxing", tracker="twist2")
+
+
 def test_startup_gives_no_success(won):
     """While the robot takes its stance neither success nor an event is reported; falls and errors are."""
     won.reset([1, 2])

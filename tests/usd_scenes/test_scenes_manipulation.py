@@ -238,6 +238,9 @@ def test_a_camera_looks_at_a_point():
         assert np.array(turn.TransformDir(Gf.Vec3d(0, 0, -1))) == pytest.approx(ahead / np.linalg.norm(ahead))
         assert turn.TransformDir(Gf.Vec3d(1, 0, 0))[2] == pytest.approx(0.0, abs=1e-9)
         assert turn.TransformDir(Gf.Vec3d(0, 1, 0))[2] >= -1e-9
+    for nowhere in ((0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0), (float("inf"), 0.0, 0.0)):
+        with pytest.raises(InputError, match="there is no direction"):
+            author.look_at((0.0, 0.0, 2.0), nowhere)
 
 
 def test_a_forgotten_or_misspelled_look_is_refused(tmp_path):
