@@ -195,7 +195,7 @@ RECORDER = "[arena_newton.recorders]\ngone = nowhere.at_all:Recorder\n"
 
 
 def test_a_package_that_does_not_load_disturbs_no_other_task(tmp_path, monkeypatch):
-    """What a package fails to give is refused by name before a run; lists, rule sets and runs have all others."""
+    """A task or recorder that its package fails to give is refused by name; lists, rule sets, runs have all others."""
     rules, known = rule_sets.get("paper").hash, tasks.names()
     info = tmp_path / "broken-1.0.dist-info"
     info.mkdir()
