@@ -34,6 +34,7 @@ SHORT: dict[str, list[str]] = {
     "own_tracker": ["--max-steps", "4"],
     "record_and_build": ["--episodes", "2", "--size", "64x64", "--max-steps", "8", "--out", "OUT"],
     "refine_reference": ["--rounds", "1"],
+    "release_depth": [*(flag.replace("boxing", "double_desk") for flag in RUN), "--policy", "stand"],
     "research": [*RUN, "--policy", "stand"],
     "slopes": ["--max-steps", "4", "--points", "3"],
     "swap": ["--max-steps", "4", "--episodes", "2"],
@@ -58,6 +59,7 @@ SAYS = {
     "own_tracker": r"13 promises kept\n(football/base/s0/r\d: timeout after 0.1 s of standing\n){2}",
     "record_and_build": r"2 episodes, 16 rows at 50 per second: .*\n  action  \[40\]\n.*images.front  \[3, 64, 64\]\n",
     "refine_reference": r"played 0: a palm comes within -0.0\d+ m after 4.9 s\n",  # a miss to refine
+    "release_depth": r"double_desk \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
     "research": r"boxing \| twist2  \| stand  \| base \| 1 \|.* 1 \|      0 \|        4\.0 \|\n",
     "slopes": r"speed .*: exact slope .*\nball's start .*: exact slope [+-]\d\.\d+, of the line .*\n",
     "swap": r"success rate through twist2: 0 of 2\nsuccess rate through sonic: 0 of 2\n",

@@ -81,8 +81,8 @@ def test_rows_of_wrists_differ_by_their_cameras():
 def test_rows_differ_by_what_they_are_named_after():
     """Each row differs from its plan's first by what its name says, and rows of both trackers have twice the steps."""
     looks = {"looks", "look_changes"}
-    rows = {"goals": looks} | dict.fromkeys(("bold", "figures"), looks | {"task_weights"})
-    rows["tuned"] = rows["figures"] | {"start_from", "lr"}
+    bold = looks | {"task_weights"}
+    rows = {"bold": bold, "tuned": bold | {"start_from", "lr"}}
     ablation = {"none": looks | {"recipe_values"}, "augmentation": looks, "untold": {"tracker_vector", "steps"}}
     ablation |= dict.fromkeys(("shapes", "light"), {"look_changes"}) | dict.fromkeys(
         ("plain-02", "plain-06"), {"looks"}
@@ -297,9 +297,7 @@ def test_the_page_has_the_middle_of_the_trainings_and_their_bars(tmp_path):
     assert "all: dynamics: 107 of 120 (113 93 107)" in said  # no bar, no verdict
     assert not any("visual: 50" in line or "dynamics: 50" in line or "twist2" in line for line in said)
     assert made(plan, tmp_path)["card all"].words()[3:5] == ["--out", str(tmp_path / "packed" / "all")]
-    assert made(plan, tmp_path, rows=[plan.row("goals")])["card goals"].words()[2] == str(
-        tmp_path / "trainings/goals_2"
-    )
+    assert made(plan, tmp_path, rows=[plan.row("bold")])["card bold"].words()[2] == str(tmp_path / "trainings/bold_2")
     page = (tmp_path / "plan.md").read_text()
     assert "| boxing | twist2 | 60 50 57 | 60 50 57 | 60 50 57 |" in page and "Seeds of its trainings: 1 2 3." in page
 
