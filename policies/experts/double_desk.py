@@ -173,11 +173,11 @@ OVER_HEIGHT = 1.02
 RIM = 0.93
 """Least height of the centre of mass above the crate [m]."""
 AIM = (0.12, 0.0)
-"""Half sizes of the rectangle in the crate to which the centre of mass is led [m]: its middle line. What learns from
-this opens the hand 4 cm nearer to the robot, and its hands scatter by 5 cm (docs/results/generalist.md)."""
+"""Half sizes of the rectangle in the crate to which the centre of mass is led [m]: its middle line. A network that
+learned from (0.18, 0.09) let go 4 cm nearer to the robot and scattered by 5 cm (docs/results/generalist.md)."""
 ENOUGH, MOST = (0.20, 0.08), (0.24, 0.15)
-"""Half sizes of the larger one in which it may be let go once it was held for `HOLD`, and at last [m]: the arm does not
-always reach as far as `AIM`. The walls are at 0.30 and 0.20 m."""
+"""Half sizes of the larger one in which it may be let go once it was held for `HOLD`, and some time later [m]: the arm
+does not always reach as far as `AIM`. The walls are at 0.30 and 0.20 m."""
 RELAX = 0.05
 """Growth from the one to the other [m/s]."""
 HOLD = 1.2
@@ -187,7 +187,7 @@ CLOSER = 0.10
 OVER_LEAN = 0.50
 """Waist pitch above the crate [rad]."""
 OVER_LEAN_MORE = 0.10
-"""Growth of that while the hammer is held there [rad/s], so that the arm reaches farther ."""
+"""Growth of that while the hammer is held there [rad/s], so that the arm reaches farther."""
 MOST_LEAN = 0.7
 """... to this limit [rad]. The hand opens with the pitch at which it came to rest."""
 
@@ -343,7 +343,7 @@ class DoubleDeskExpert(Expert):
         return torch.gather(speeds, 1, soon)[:, 0], torch.gather(times, 1, soon)[:, 0]
 
     def _over(self) -> tuple[Tensor, Tensor]:
-        """Target of the centre of mass above the crate [m], [worlds, 3]; whether to release it, [worlds]."""
+        """Target of the centre of mass above the crate [m], [worlds, 3]; whether to release it by now, [worlds]."""
         mass, middle = self._mass(), self._middle()
         yaw = heading(self.sight.body(self._crate)[1])
         local = rotate_xy(-yaw, mass[:, :2] - middle[:, :2])

@@ -34,10 +34,12 @@ def episodes(env, *repeats, group=900):
     return [SimpleNamespace(episode_seed=seeding.episode_seed(env.spec.gym_id, group, i)) for i in repeats]
 
 
-def expert_rollout(env, played, ticks=None, **more):
+def expert_rollout(env, played, ticks=None, recorders=(), **more):
     """Results of the expert in the plan's order, and its actions by seed, one row per tick."""
     actions = Actions()
-    results = Rollout(env, policies.get("expert"), played, recorder=[actions], max_steps=ticks, **more).run()
+    results = Rollout(
+        env, policies.get("expert"), played, recorder=[actions, *recorders], max_steps=ticks, **more
+    ).run()
     return results, actions.rows
 
 
