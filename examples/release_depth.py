@@ -1,4 +1,4 @@
-"""Where a policy lets go of the hammer: a metric that one class and one line add to an ordinary run.
+"""Measure where a policy lets go of the hammer: a metric that one class and one line add to an ordinary run.
 
 Shows: a `Metric` of this process, which reads the policy's action and true poses. `release_depth` is how far beyond the
 crate's middle line the hammer's centre of mass is when the left hand opens above the crate [m]. Negative is towards the
