@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -39,6 +40,10 @@ SKIPPED_STEPS = 10
 """First steps, which are not measured: a graph is captured, memory is taken."""
 MEASURED_FRACTION = 0.1
 """Most of --minutes that the measurement takes, where steps are slow."""
+MEASUREMENTS = 10
+"""The speed is measured again after such a part of the steps that are left."""
+LARGEST_CHANGE = 0.1
+"""Largest change of the number of steps that leaves the schedule as it was."""
 TIME_KEPT = 0.98
 """Fraction of the time left that steps are planned for; the rest is for checkpoints and held-out losses."""
 STOP_STEPS = 20
@@ -88,6 +93,7 @@ class TrainingLoop:
         self._started = 0.0
         self._stopped = False
         self._measured_from: tuple[int, float] | None = None
+        self._measure_at = 0
         self._last: Path | None = None
         self._last_row: dict[str, float] = {}
 
@@ -117,13 +123,16 @@ class TrainingLoop:
             remove_older(self._out, 0)
         pairs = tuple(trainer.drawn)
         log = TrainingLog(self._out, step=trainer.step, quiet=options.quiet, pairs=pairs) if first else None
-        begin = trainer.step
+        begin, said = trainer.step, ""
         self._started = time.monotonic()
         try:
             with _stopping(self._stop):
                 row_at = (trainer.step, self._started)
                 while not self._total or trainer.step < self._total:
                     trainer.advance()
+                    if trainer.compiler_fault != said:
+                        said = trainer.compiler_fault
+                        print(said, file=sys.stderr, flush=True)
                     self._fit_to_time(begin)
                     done = bool(self._total) and trainer.step >= self._total
                     if log is not None:
@@ -168,30 +177,38 @@ class TrainingLoop:
         return self._stopped
 
     def _fit_to_time(self, begin: int) -> None:
-        """Fix the number of steps once their speed is known."""
-        if self._total:
-            return
+        """Fix the number of steps once their speed is known, anew where other programs change it in the first half."""
         trainer, budget = self._trainer, self._options.minutes
-        taken = trainer.step - begin
+        if not budget or (self._total and not self._measure_at <= trainer.step <= self._total / 2):
+            return
         if self._measured_from is None:
-            if taken >= SKIPPED_STEPS or self.minutes - self._before > MEASURED_FRACTION / 2 * budget:
+            taken = trainer.step - begin
+            if self._total or taken >= SKIPPED_STEPS or self.minutes - self._before > MEASURED_FRACTION / 2 * budget:
                 _wait(trainer.device)
                 self._measured_from = trainer.step, time.monotonic()
+                self._plan_next()
             return
         since, at = self._measured_from
         count = trainer.step - since
-        if count < MEASURED_STEPS and self.minutes - self._before < MEASURED_FRACTION * budget:
+        if not self._total and count < MEASURED_STEPS and self.minutes - self._before < MEASURED_FRACTION * budget:
             return
         _wait(trainer.device)
-        per_step = (time.monotonic() - at) / count
+        now = time.monotonic()
         left = max(0.0, budget - self.minutes) * 60.0 * TIME_KEPT
-        steps = trainer.step + int(left / max(per_step, 1e-9))
+        steps = trainer.step + int(left * count / max(now - at, 1e-9))
         if self._processes.count > 1:
             agreed = torch.tensor(float(steps), dtype=torch.float64, device=trainer.device)
             torch.distributed.broadcast(agreed, 0)
             steps = int(agreed)
-        self._total = max(steps, trainer.step)
-        trainer.fix_steps(self._total)
+        if abs(steps - self._total) > LARGEST_CHANGE * self._total:
+            self._total = max(steps, trainer.step)
+            trainer.fix_steps(self._total)
+        self._measured_from = trainer.step, now
+        self._plan_next()
+
+    def _plan_next(self) -> None:
+        """Choose the step at which the speed is measured again."""
+        self._measure_at = self._trainer.step + max(MEASURED_STEPS, (self._total - self._trainer.step) // MEASUREMENTS)
 
     def _log(self, log: TrainingLog | None, row_at: tuple[int, float], held: bool) -> tuple[int, float]:
         """Write a row; returns step and time from which the next one's speed counts."""

@@ -26,7 +26,7 @@ from arena_newton.files.new_folder import link, new_folder
 from arena_newton.files.text import counted
 from arena_newton.files.untrusted_files import numbers, read_arrays, read_bytes
 from arena_newton.pages.tables import Table
-from arena_newton.pictures.video import VideoWriter
+from arena_newton.pictures.video import VideoWriter, key_frames
 from arena_newton.rules import seeding
 
 if TYPE_CHECKING:
@@ -58,9 +58,6 @@ MARKER = "raw_frame_index"
 """Frame index of the source in the original's SONIC recordings, which have others beside it."""
 ONCE = ("arena_phase_names", "arena_final_qpos", "schema_version", "task")
 """Fields that are not rows, whatever their length."""
-DEFAULT_GOP, SMALL_GOP, SMALL = 2, 10, 256
-"""Frames between key frames where a recording does not say how it was encoded: pictures up to `SMALL` px high have
-the larger number, as the recorder has it."""
 
 
 @dataclass(frozen=True)
@@ -283,7 +280,7 @@ def _encoded_again(
                     picture = picture[: int(size[1]), : int(size[0])]
                 if writer is None:
                     height, width = picture.shape[:2]
-                    gop = gop or (SMALL_GOP if height <= SMALL else DEFAULT_GOP)
+                    gop = gop or key_frames(height)
                     writer = VideoWriter(target, width, height, rate, crf=crf, gop=gop, b_frames=b_frames)
                 writer.write(np.ascontiguousarray(picture))
                 add_picture(histogram, picture)

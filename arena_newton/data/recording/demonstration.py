@@ -18,7 +18,7 @@ import warp as wp
 from arena_newton.data.recording.encoder_pool import EncoderPool
 from arena_newton.data.recording.encoding import EncoderThreads, Pictured, VideoEncoder, VideoStream
 from arena_newton.data.recording.episode import SCHEMA_VERSION, VIDEO_FOLDER, looks_film, vision, write_episode
-from arena_newton.data.recording.episode_film import CRF, FilmFacts, key_frames
+from arena_newton.data.recording.episode_film import CRF, FilmFacts
 from arena_newton.data.recording.image_statistics import VALUES
 from arena_newton.data.recording.look_planes import LookPlanes
 from arena_newton.errors import ArenaError, InputError
@@ -26,6 +26,7 @@ from arena_newton.files.own_files import PARTIAL, file_label
 from arena_newton.interfaces import Recorder
 from arena_newton.kernels.pictures.histogram import launch_histogram
 from arena_newton.pictures.camera import Camera
+from arena_newton.pictures.video import key_frames
 from arena_newton.robot import g1
 from arena_newton.robot.canonical import ACTION, HAND_CLOSED, STATE
 from arena_newton.robot.rotations import matrix_from_quat, quat_apply, quat_conjugate

@@ -13,21 +13,12 @@ from typing import BinaryIO
 import numpy as np
 
 from arena_newton.files.untrusted_files import create
-from arena_newton.pictures.video import VideoWriter
+from arena_newton.pictures.video import VideoWriter, key_frames
 
-__all__ = ["CRF", "Film", "FilmFacts", "key_frames"]
+__all__ = ["CRF", "Film", "FilmFacts"]
 
-SMALL = 256
-"""Pictures up to this height [px] have a key frame every `GOP_SMALL` frames, larger ones every `GOP_LARGE`."""
-GOP_SMALL, GOP_LARGE = 10, 2
-"""Frames from one key frame to the next, between the size of the files and the time to read any one frame."""
 CRF = 20
 """Constant rate factor of x264."""
-
-
-def key_frames(height: int) -> int:
-    """Frames from one key frame to the next, of pictures of this height [px]."""
-    return GOP_SMALL if height <= SMALL else GOP_LARGE
 
 
 @dataclass(frozen=True)
@@ -70,8 +61,9 @@ class Film:
         """
         if self._writer is None:
             height, width = picture.shape[:2]
-            gop = key_frames(height)
-            self._writer = VideoWriter(self.video, width, height, self.fps, crf=CRF, gop=gop, **self._how)
+            self._writer = VideoWriter(
+                self.video, width, height, self.fps, crf=CRF, gop=key_frames(height), **self._how
+            )
         self._writer.write(picture)
         if depth is not None:
             if self._depth_file is None:

@@ -277,15 +277,15 @@ def test_processes_train_one_network(dataset, tmp_path, monkeypatch):
     assert not torch.distributed.is_initialized()
 
 
-def a_second_a_step(monkeypatch):
-    """A clock by which each step takes a second."""
+def a_second_a_step(monkeypatch, later=1.0, since=0):
+    """A clock by which each step takes a second, from some step on another time."""
     clock = [1000.0]
     monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     advance = PolicyTrainer.advance
 
     def slow(self):
         advance(self)
-        clock[0] += 1.0
+        clock[0] += later if self.step > since > 0 else 1.0
 
     monkeypatch.setattr(PolicyTrainer, "advance", slow)
 
@@ -299,6 +299,18 @@ def test_the_schedule_ends_when_the_time_is_up(dataset, tmp_path, monkeypatch):
     rates = [float(row["learning_rate"]) for row in rows(tmp_path / "run")]
     low = recipe("act", "small").final_lr_fraction * max(rates)
     assert rates[-1] == pytest.approx(low, rel=0.5) and rates[15] == pytest.approx(max(rates) / 2, rel=0.2)
+
+
+def test_the_schedule_is_shortened_where_steps_become_slower(dataset, tmp_path, monkeypatch):
+    """Of 60 s a step takes one second, from the ninth on two: 34 steps, whose cosine reaches its end; in time."""
+    monkeypatch.setattr(training_loop, "MEASURED_STEPS", 4)
+    monkeypatch.setattr(training_loop, "SKIPPED_STEPS", 2)
+    a_second_a_step(monkeypatch, later=2.0, since=8)
+    folder = train(options(dataset, tmp_path / "run", steps=0, minutes=1.0, log_every=1, save_every=0))
+    facts = CheckpointFacts.read(folder)
+    assert 30 <= facts.steps <= 36 and 0.9 <= facts.minutes <= 1.05
+    rates = [float(row["learning_rate"]) for row in rows(tmp_path / "run")]
+    assert rates[-1] == pytest.approx(recipe("act", "small").final_lr_fraction * max(rates), rel=0.5)
 
 
 def test_another_time_on_resume_is_kept(dataset, tmp_path, monkeypatch):
