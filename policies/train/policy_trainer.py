@@ -152,7 +152,7 @@ class PolicyTrainer:
             self._frozen = self._norms_frozen
             self._graphs.clear()
             self._training_mode()
-            self._agrees = not self._compiled
+            self._agrees = not self._compiled or bool(self.compiler_fault)
         with compiler_errors() if self._compiled else contextlib.nullcontext():
             if not self._agrees:
                 self._compare_compiled()
@@ -298,13 +298,11 @@ class PolicyTrainer:
         self._put_back(before)
         if self._agrees:
             return
+        self._agrees = True  # from here on there is nothing to compare
         worst = max(each, key=lambda name: abs(each[name] - own.get(name, 0.0)))
-        self.compiler_fault, self._agrees = (
-            (
-                f"--compile: step {self.step}: the compiled network's gradient has norm {compiled:.4g}, the network's "
-                f"own {norm:.4g} (most in {worst}): torch {torch.__version__} compiles it wrongly; trains on without"
-            ),
-            True,
+        self.compiler_fault = (
+            f"--compile: step {self.step}: the compiled network's gradient has norm {compiled:.4g}, the network's "
+            f"own {norm:.4g} (most in {worst}): torch {torch.__version__} compiles it wrongly; trains on without"
         )
 
     def _gradient_norms(self, context: contextlib.AbstractContextManager[None]) -> tuple[dict[str, float], float]:
