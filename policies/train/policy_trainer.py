@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -289,9 +290,11 @@ class PolicyTrainer:
         If they differ, all further steps are the network's own.
         """
         before = _copied(self.model.policy.state_dict())
-        own, norm = self._gradient_norms(uncompiled())
+        own = self._gradient_norms(uncompiled())
+        norm = math.hypot(*own.values())
         for _ in range(COMPILED_TRIES):
-            each, compiled = self._gradient_norms(contextlib.nullcontext())
+            each = self._gradient_norms(contextlib.nullcontext())
+            compiled = math.hypot(*each.values())
             self._agrees = norm / LARGEST_RATIO <= compiled <= norm * LARGEST_RATIO
             if self._agrees:
                 break
@@ -305,14 +308,14 @@ class PolicyTrainer:
             f"own {norm:.4g} (most in {worst}): torch {torch.__version__} compiles it wrongly; trains on without"
         )
 
-    def _gradient_norms(self, context: contextlib.AbstractContextManager[None]) -> tuple[dict[str, float], float]:
-        """Norms of the gradients of a step that is not taken: each parameter's, and that of all."""
+    def _gradient_norms(self, context: contextlib.AbstractContextManager[None]) -> dict[str, float]:
+        """Norm of each parameter's gradient in a step that is not taken."""
         self._prepare(self.step)
         with context:
             self._descend()
         found = {name: p.grad for name, p in self.model.policy.named_parameters() if p.grad is not None}
         norms = torch.stack([torch.linalg.vector_norm(gradient.float()) for gradient in found.values()])
-        return dict(zip(found, norms.tolist(), strict=True)), float(norms.square().sum().sqrt())
+        return dict(zip(found, norms.tolist(), strict=True))
 
     def _put_back(self, before: Mapping[str, torch.Tensor]) -> None:
         """Give the network its tensors of before steps that do not count, and forget their losses and gradients."""

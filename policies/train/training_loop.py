@@ -93,7 +93,6 @@ class TrainingLoop:
         self._started = 0.0
         self._stopped = False
         self._measured_from: tuple[int, float] | None = None
-        self._measure_at = 0
         self._last: Path | None = None
         self._last_row: dict[str, float] = {}
 
@@ -179,18 +178,19 @@ class TrainingLoop:
     def _fit_to_time(self, begin: int) -> None:
         """Fix the number of steps once their speed is known, anew where other programs change it in the first half."""
         trainer, budget = self._trainer, self._options.minutes
-        if not budget or (self._total and not self._measure_at <= trainer.step <= self._total / 2):
+        if not budget or (self._total and trainer.step > self._total / 2):
             return
         if self._measured_from is None:
             taken = trainer.step - begin
             if self._total or taken >= SKIPPED_STEPS or self.minutes - self._before > MEASURED_FRACTION / 2 * budget:
                 _wait(trainer.device)
                 self._measured_from = trainer.step, time.monotonic()
-                self._plan_next()
             return
         since, at = self._measured_from
         count = trainer.step - since
-        if not self._total and count < MEASURED_STEPS and self.minutes - self._before < MEASURED_FRACTION * budget:
+        if count < max(MEASURED_STEPS, (self._total - since) // MEASUREMENTS) and (
+            self._total or self.minutes - self._before < MEASURED_FRACTION * budget
+        ):
             return
         _wait(trainer.device)
         now = time.monotonic()
@@ -204,11 +204,6 @@ class TrainingLoop:
             self._total = max(steps, trainer.step)
             trainer.fix_steps(self._total)
         self._measured_from = trainer.step, now
-        self._plan_next()
-
-    def _plan_next(self) -> None:
-        """Choose the step at which the speed is measured again."""
-        self._measure_at = self._trainer.step + max(MEASURED_STEPS, (self._total - self._trainer.step) // MEASUREMENTS)
 
     def _log(self, log: TrainingLog | None, row_at: tuple[int, float], held: bool) -> tuple[int, float]:
         """Write a row; returns step and time from which the next one's speed counts."""
