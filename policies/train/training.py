@@ -96,7 +96,7 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
     device = torch_device(options.device)
     processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     try:
-        with _group(device, processes), fast_kernels(device):
+        with _group(device, processes), fast_kernels(device), _threads(options.jobs):
             return _train(options, settings, out, device, processes, progress, checkpoint, start)
     except torch.OutOfMemoryError as error:
         text = " ".join(str(error).split())[:160]
@@ -146,7 +146,7 @@ def _train(
         changes = look_changes(options.look_changes)
         looks = load_looks(datasets, store, *look_fractions(options.looks), changes, jobs=jobs, network=network)
         store = dataclasses.replace(store, looks=looks)
-    if speaks:
+    if processes.first:
         size = store.pictures.numel() / 1e9
         print(
             f"{counted(len(store.lengths), 'episode')} ({sum(store.held)} held out), {len(store.pictures)} pictures, "
@@ -344,6 +344,20 @@ def fast_kernels(device: torch.device) -> Iterator[None]:
         matmul.allow_tf32, cudnn.allow_tf32, cudnn.benchmark = before
         if device.type == "cuda":
             torch.cuda.empty_cache()
+
+
+@contextlib.contextmanager
+def _threads(jobs: int) -> Iterator[None]:
+    """Give torch as many threads as cores; 0: those that it has.
+
+    Each training that shares a machine would otherwise have a thread a core, and their ends wait for each other.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(jobs or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager
