@@ -118,8 +118,8 @@ class PolicyTrainOptions:
     compile: bool = False
     """Compile the network with torch.compile, which takes a minute or so at the first step; not for pi05."""
     jobs: int = field(default=0, metadata=bounds(0, 1024))
-    """Cores that it takes: they decode pictures, four or more by a process each, fewer by threads, and are as many
-    threads of torch; 0: all that may be used."""
+    """Cores that it takes: they decode pictures, four or more by a process each, fewer by threads, and torch has no
+    more threads; 0: all that may be used."""
     quiet: bool = False
     """Show no progress bar."""
 

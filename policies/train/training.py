@@ -348,12 +348,12 @@ def fast_kernels(device: torch.device) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _threads(jobs: int) -> Iterator[None]:
-    """Give torch as many threads as cores; 0: those that it has.
+    """Give torch no more threads than cores; 0: those that it has.
 
     Each training that shares a machine would otherwise have a thread a core, and their ends wait for each other.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(jobs or before)
+    torch.set_num_threads(min(jobs or before, before))
     try:
         yield
     finally:
