@@ -15,7 +15,6 @@ from pathlib import Path
 
 import datasets
 import numpy as np
-import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.import_utils import get_safe_default_video_backend
 
@@ -30,6 +29,7 @@ from arena_newton.errors import InputError
 from arena_newton.eval.bench.timing import BenchFigure
 from arena_newton.files.new_folder import scratch_folder
 from arena_newton.files.text import counted
+from arena_newton.physics.devices import torch_threads
 from benchmarks.bench_options import DatasetBenchOptions
 from benchmarks.episode_copies import copy_episodes
 
@@ -104,18 +104,15 @@ def _reads(root: Path, options: DatasetBenchOptions, scratch: Path | None = None
     files = DatasetFiles(root)
     frames = Frames(root)
     order = np.random.default_rng(options.seed).integers(0, len(frames), WARM_READS + options.reads).tolist()
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     logging.getLogger("lerobot").setLevel(logging.ERROR)
     try:
         height, width = frames[0].shape[:2]
-        with _cache_in(scratch):
+        with torch_threads(1), _cache_in(scratch):
             dataset = LeRobotDataset(f"local/{root.resolve().name}", root=root, return_uint8=True)
             backend = get_safe_default_video_backend()
             read, own = _rates(order, (dataset.__getitem__, frames.__getitem__))
     finally:
         frames.close()
-        torch.set_num_threads(threads)
     cameras = len(files.video_keys)
     about = f"{width}x{height}, {counted(files.episodes, 'episode')}, {counted(cameras, 'camera')}"
     bars = (READS_BAR, OWN_READS_BAR) if max(height, width) <= BAR_SIZE else (None, None)

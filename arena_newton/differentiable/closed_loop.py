@@ -18,6 +18,7 @@ from arena_newton.differentiable.kernel_gradients import ReferenceState, referen
 from arena_newton.errors import InputError
 from arena_newton.interfaces import RobotState, Tracker, TrackerCommand
 from arena_newton.kernels import tick as codes
+from arena_newton.physics.devices import torch_threads
 from arena_newton.physics.dynamics import NOISES, value_of
 from arena_newton.physics.mujoco_engine import MujocoPhysics
 from arena_newton.physics.policy_view import PolicyView
@@ -102,13 +103,11 @@ def closed_loop(
     if isinstance(actor, torch.Tensor) and actor.shape != shape:
         raise InputError(f"closed_loop: actions of shape {list(actor.shape)}, expected {list(shape)}")
     env.reset(list(seeds))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # on a busy machine two threads take twenty times longer for products of a few rows
     try:
-        loop = _Loop(env, EngineStep(env.physics, parameters), factors)
-        return loop.run(actor, list(seeds), ticks, start, truncate or 0, checkpoint or 0)
+        with torch_threads(1):  # on a busy machine two take twenty times longer for products of a few rows
+            loop = _Loop(env, EngineStep(env.physics, parameters), factors)
+            return loop.run(actor, list(seeds), ticks, start, truncate or 0, checkpoint or 0)
     finally:
-        torch.set_num_threads(threads)
         env.release(range(env.worlds))
 
 

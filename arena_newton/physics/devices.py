@@ -8,6 +8,7 @@ import itertools
 import os
 import re
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from arena_newton.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["cluster_engine", "resolve_engine", "torch_device", "visible_gpus"]
+__all__ = ["cluster_engine", "resolve_engine", "torch_device", "torch_threads", "visible_gpus"]
 
 NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
@@ -78,6 +79,19 @@ def torch_device(name: str | None) -> torch.device:
     if int(own or 0) >= gpus:
         raise InputError(f"--device {name}: no such device, this machine has {gpus} for CUDA")
     return torch.device("cuda", int(own or 0))
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Give torch so many threads, in this thread and in those that begin meanwhile; what it had before returns."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _loads(library: str) -> bool:

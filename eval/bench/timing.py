@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
-import torch
 import warp as wp
 
 from arena_newton import trackers
@@ -18,6 +17,7 @@ from arena_newton.env import ArenaEnv
 from arena_newton.errors import InputError
 from arena_newton.eval.plan import episode_plan
 from arena_newton.interfaces import Disturbance, EpisodeResult, Recorder
+from arena_newton.physics.devices import torch_threads
 from arena_newton.pictures.settings import policy_cameras
 from arena_newton.policies.base import Policy
 from arena_newton.rollout import Rollout
@@ -117,15 +117,14 @@ def seconds_of(work: Callable[[], object]) -> float:
 @contextlib.contextmanager
 def cores(count: int) -> Iterator[int]:
     """Restrict this process to ``count`` cores; yields how many there are."""
-    before, threads = os.sched_getaffinity(0), torch.get_num_threads()
+    before = os.sched_getaffinity(0)
     kept = set(sorted(before)[:count])
     os.sched_setaffinity(0, kept)
-    torch.set_num_threads(len(kept))
     try:
-        yield len(kept)
+        with torch_threads(len(kept)):
+            yield len(kept)
     finally:
         os.sched_setaffinity(0, before)
-        torch.set_num_threads(threads)
 
 
 class RepeatedEpisodes:

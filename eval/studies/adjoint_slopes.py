@@ -21,6 +21,7 @@ from arena_newton.eval.studies.placed_play import PlacedWorlds
 from arena_newton.eval.studies.placement_files import SLOPES, PlacedStudy, summary_json
 from arena_newton.eval.studies.placement_options import PlacementOptions
 from arena_newton.pages.tables import Table, csv_lines
+from arena_newton.physics.devices import torch_threads
 from arena_newton.tasks.handles import ROBOT
 
 __all__ = ["KINDS", "Slope", "groups", "play_slopes", "slope_head", "worth"]
@@ -97,12 +98,10 @@ def play_slopes(
         )
     grid = [(a.margin - b.margin) / (2.0 * scales[1]) for a, b in zip(others[::2], others[1::2], strict=True)]
     env = cast("ArenaEnv", make_env(worlds.config, factories, worlds.config.episodes[0], 1))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as `closed_loop` does, for the gradient
     try:
-        found, answers = _slopes(_Moved(env, worlds, seed, at), played.steps, scales, grid)
+        with torch_threads(1):  # as `closed_loop` does, for the gradient
+            found, answers = _slopes(_Moved(env, worlds, seed, at), played.steps, scales, grid)
     finally:
-        torch.set_num_threads(threads)
         env.close()
     head = slope_head(scales)
     cells = [one.cells() for one in found]

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from arena_newton.errors import InputError
+from arena_newton.physics.devices import torch_threads
 from arena_newton.policies.base import Chunk, Json, Observation, Policy, world_mask
 from arena_newton.policies.learned import learned_card
 from arena_newton.policies.learned.act_network import ActNetwork
@@ -183,13 +184,9 @@ def _answers(
         return
     last = len(parts) % threads
     whole, divided = parts[: len(parts) - last], parts[len(parts) - last :]
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            yield from pool.map(lambda some: query(some, 1), whole)
-            yield from pool.map(lambda some: query(some, min(threads - last + 1, HELPED)), divided)
-    finally:
-        torch.set_num_threads(threads)  # of this thread, and of those that begin later
+    with torch_threads(1), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        yield from pool.map(lambda some: query(some, 1), whole)
+        yield from pool.map(lambda some: query(some, min(threads - last + 1, HELPED)), divided)
 
 
 def from_spec(argument: str | None, *, device: str | torch.device | None = None) -> LearnedPolicy:

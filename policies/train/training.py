@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from arena_newton.errors import ArenaError, InputError
 from arena_newton.files.text import counted
-from arena_newton.physics.devices import torch_device
+from arena_newton.physics.devices import torch_device, torch_threads
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, vector_of
 from arena_newton.policies.recipes.training_recipe import REALIGN, TrainingRecipe, recipe, with_pretrained
 from arena_newton.policies.train.families import families
@@ -95,8 +95,10 @@ def train(options: PolicyTrainOptions, named: Collection[str] = ()) -> Path:
         check_new(out)
     device = torch_device(options.device)
     processes = Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    most = torch.get_num_threads()
+    threads = min(options.jobs or most, most)  # those of trainings that share a machine would wait for each other
     try:
-        with _group(device, processes), fast_kernels(device), _threads(options.jobs):
+        with _group(device, processes), fast_kernels(device), torch_threads(threads):
             return _train(options, settings, out, device, processes, progress, checkpoint, start)
     except torch.OutOfMemoryError as error:
         text = " ".join(str(error).split())[:160]
@@ -344,20 +346,6 @@ def fast_kernels(device: torch.device) -> Iterator[None]:
         matmul.allow_tf32, cudnn.allow_tf32, cudnn.benchmark = before
         if device.type == "cuda":
             torch.cuda.empty_cache()
-
-
-@contextlib.contextmanager
-def _threads(jobs: int) -> Iterator[None]:
-    """Give torch no more threads than cores; 0: those that it has.
-
-    Each training that shares a machine would otherwise have a thread a core, and their ends wait for each other.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(min(jobs or before, before))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.physics.devices import torch_threads
 from benchmarks import measured_training, training_bench
 from benchmarks.__main__ import main
 from benchmarks.bench_options import TrainingBenchOptions
@@ -23,10 +23,8 @@ SMALL = TrainingBenchOptions(recipe="small", device="cpu", frames=100, seconds=0
 def narrow(monkeypatch):
     """A vision encoder that trains in milliseconds, in one thread."""
     narrow_network.install(monkeypatch.setattr)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with torch_threads(1):
+        yield
 
 
 def test_trainings_are_measured_side_by_side(monkeypatch):

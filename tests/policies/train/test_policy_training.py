@@ -21,6 +21,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
 from arena_newton.errors import ArenaError, InputError
+from arena_newton.physics.devices import torch_threads
 from arena_newton.pictures.settings import CameraConfig
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts, checkpoint_folder
 from arena_newton.policies.lerobot.checkpoint_policy import LeRobotPolicy
@@ -431,14 +432,10 @@ def test_a_training_has_no_more_threads_than_cores_are_given(dataset, tmp_path, 
     """`--jobs` of a training that shares its machine; what was set before returns. Its log says what was decoded."""
     found, build = [], training.families.build
     monkeypatch.setattr(training.families, "build", lambda *a: found.append(torch.get_num_threads()) or build(*a))
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         for jobs in (0, 1, 3):
             train(options(dataset, tmp_path / str(jobs), steps=1, jobs=jobs))
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
     assert found == [2, 1, 2]
     assert capsys.readouterr().out.count("pictures, 0.0") == 3
 
