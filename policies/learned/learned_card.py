@@ -157,7 +157,7 @@ class PolicyCard:
             "GPU minutes": f"{self.processes * self.gpu_minutes:.1f} on {self._devices()}",
             "packed by": f"`{self.packed_by}`" if self.packed_by else "",
             "size": f"{self.bytes / 1e6:.1f} MB, matrices in {self.precision}, computed in float32",
-            "weights": self.weights,
+            "weights": self.weights + f"; {self.trained_weights} before rounding" * bool(self.trained_weights),
             "other trainings": ", ".join(
                 f"seed {one.seed} (weights {one.weights}{', demonstrations recorded again' * one.recorded_again})"
                 for one in self.trainings
