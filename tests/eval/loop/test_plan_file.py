@@ -87,8 +87,8 @@ def test_rows_differ_by_what_they_are_named_after():
     ablation |= dict.fromkeys(("shapes", "light"), {"look_changes"}) | dict.fromkeys(
         ("plain-02", "plain-06"), {"looks"}
     )
-    ablation |= dict.fromkeys(("told", "twist2", "sonic"), looks | {"steps"})
-    ablation |= {"untold": looks | {"steps", "tracker_vector"}}
+    ablation |= dict.fromkeys(("told", "twist2", "sonic"), looks | {"steps", "batch_size"})
+    ablation |= {"untold": looks | {"steps", "batch_size", "tracker_vector"}}
     for name, expected in {"generalist": rows, "ablation": ablation}.items():
         first, *others = read_plan(name).rows
         assert expected == {
@@ -98,7 +98,7 @@ def test_rows_differ_by_what_they_are_named_after():
 
 
 def test_the_ablation_has_the_demonstrations_and_the_recipe_of_the_generalist():
-    """Its first row is the generalist's on three tasks, with fewer steps; singles has the demonstrations of all."""
+    """Its first row is the generalist's on fewer tasks, with fewer and smaller steps; singles has the demonstrations of all."""
     ablation, plan = read_plan("ablation"), read_plan("generalist")
     assert ablation.record == plan.record and ablation.attempts.items() <= plan.attempts.items()
     singles = read_plan("singles")
@@ -109,7 +109,7 @@ def test_the_ablation_has_the_demonstrations_and_the_recipe_of_the_generalist():
     )
     mine, theirs = (vars(one.rows[0].train) for one in (ablation, plan))
     differ = {key for key in mine if mine[key] != theirs[key]}
-    assert differ == {"steps", "lr", "hold_out_every", "looks", "task_weights"}
+    assert differ == {"steps", "lr", "batch_size", "hold_out_every", "looks", "task_weights"}
 
 
 def test_commands_are_those_of_the_house(tmp_path):
