@@ -98,7 +98,7 @@ def test_rows_differ_by_what_they_are_named_after():
 
 
 def test_the_ablation_has_the_demonstrations_and_the_recipe_of_the_generalist():
-    """Its first row is the generalist's on fewer tasks, with fewer and smaller steps; singles has the demonstrations of all."""
+    """Its first row is the generalist's on fewer tasks, in smaller steps; singles has the demonstrations of all."""
     ablation, plan = read_plan("ablation"), read_plan("generalist")
     assert ablation.record == plan.record and ablation.attempts.items() <= plan.attempts.items()
     singles = read_plan("singles")
