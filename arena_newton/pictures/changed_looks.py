@@ -62,8 +62,7 @@ SEMANTIC_COLOURS = (
     (0.235, 0.076, 0.065),  # carpet.png
     (0.202, 0.065, 0.054),  # carpet.png
 )
-"""Albedo of what semantic mode and the variant scenes show and base mode does not, linear RGB; of a texture its main
-colours."""
+"""Albedo of what semantic mode shows and base mode does not, linear RGB; of a texture its main colours."""
 APART = 0.07
 """Least distance of a drawn colour from each of them as a picture shows it, in RGB from 0 to 1."""
 COLOURS = 4096

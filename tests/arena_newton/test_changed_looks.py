@@ -49,9 +49,14 @@ def coded(colours):
 
 
 def semantic_colours():
-    """Albedo of every look that a variant of a task's scene shows and its base does not: texture or colour → linear."""
+    """Albedo of every look that a scene's own variant shows and its base does not: texture or colour → linear.
+
+    Held-out rooms are scenes of their own and not among them: no training is chosen by what they show.
+    """
     found = {}
     for file in sorted(SCENES.glob("*/variants/*.usda")):
+        if file.stem[-1].isdigit():
+            continue
         shown = [bound(SCENES / file.parts[-3] / "scene.usda", name) for name in ("base", file.stem)]
         for look, prims in shown[1].items():
             if prims - shown[0].get(look, set()):
@@ -93,15 +98,16 @@ def main_colours(texture):
 
 
 def test_no_drawn_colour_is_one_of_semantic_modes():
-    """Each of the 4,096 colours that shapes may get differs from every colour and texture that only variants show."""
+    """Each of the 4,096 colours that shapes may get differs from every colour and texture that only semantic mode shows."""
     found = semantic_colours()
     assert {"brick.png", "tiles.png", "wood.png", "hazard.png", (0.05, 0.16, 0.38), (0.8, 0.22, 0.02)} <= set(found)
     drawn = palette(CPU).numpy()
     assert drawn.shape == (looks.COLOURS, 3) and len(np.unique(drawn.round(3), axis=0)) > 4000
     for look, colours in found.items():
-        shown = seen_colours(np.array(colours))
-        apart = np.linalg.norm(drawn[:, None] - shown[None], axis=2).min()
-        assert apart > looks.APART - 0.02, (look, apart)  # colours of textures are listed to three digits
+        listed = np.linalg.norm(np.array(colours)[:, None] - np.array(looks.SEMANTIC_COLOURS), axis=2).min(axis=1)
+        assert listed.max() < 0.01, (look, listed)  # colours of textures are listed to three digits
+        apart = np.linalg.norm(drawn[:, None] - seen_colours(np.array(colours)), axis=2).min()
+        assert apart > 0.06, (look, apart)
     # The colours are spread as widely as that allows: some are near the distance that is kept.
     assert np.linalg.norm(drawn[:, None] - seen_colours(np.array(looks.SEMANTIC_COLOURS)), axis=2).min() < 0.08
 

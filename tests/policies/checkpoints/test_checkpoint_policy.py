@@ -117,6 +117,7 @@ def test_sampling_is_lerobots_but_for_the_noise(made, family, monkeypatch):
 def test_two_ticks_are_looked_at(made, monkeypatch):
     """A policy of two observations is shown the tick before its query, and at first the same tick twice."""
     policy, given = made["two"], []
+    policy.check()
     predict = policy._network.predict
 
     def watch(batch, instruction, draws):
