@@ -26,7 +26,7 @@ COLD, WARM = 70.0, 4.0
 LIBRARIES = "interpreter and libraries"
 """Name of the part that is not judged: nothing here makes it faster."""
 LOADED = "import time, torch, warp, newton, mujoco_warp; began = time.perf_counter()"
-"""What each process does first."""
+"""First words of each process: loads what is not judged, then begins the clock."""
 TIMEOUT = 900.0
 """Longest start that is waited for [s]."""
 
