@@ -10,16 +10,20 @@ from __future__ import annotations
 import ctypes
 import functools
 import inspect
+import itertools
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
-__all__ = ["Recorded", "launch", "launcher", "record"]
+__all__ = ["Recorded", "launch", "launch_divided", "launcher", "record"]
 
 OUTPUTS = ("counter", "success", "margin", "event")
 """Names of arguments from which on those of a kernel are outputs."""
+PARTS = 2
+"""Parts of a divided launch per thread, so that a slow core delays nobody."""
 
 
 class Recorded:
@@ -97,6 +101,33 @@ def launch(
     else:
         command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
         _recording.into.add(command)
+
+
+def launch_divided(
+    kernel: wp.Kernel, dim: Sequence[int], axis: int, inputs: Sequence[Any], outputs: Sequence[Any], threads: int
+) -> None:
+    """Do what `launch` does; on the CPU some threads each take the next part of one dimension.
+
+    Args:
+        kernel: Its first argument, which is not in `inputs`, is the first index of the part.
+        dim: Of the whole launch.
+        axis: The dimension; different indices must write different elements.
+        inputs: The other inputs.
+        outputs: Its outputs.
+        threads: Threads on the CPU.
+    """
+    if threads == 1 or dim[axis] == 1 or not outputs[0].device.is_cpu:
+        launch(kernel, dim, [0, *inputs], outputs)
+        return
+    count = min(PARTS * threads, dim[axis])
+    starts = [dim[axis] * part // count for part in range(count + 1)]
+    # Packed in this thread: two that load a module at once would both compile it.
+    parts = [
+        record(launch, kernel, (*dim[:axis], end - first, *dim[axis + 1 :]), [first, *inputs], outputs)
+        for first, end in itertools.pairwise(starts)
+    ]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(Recorded.__call__, parts))
 
 
 def launcher(kernel: wp.Kernel, **defaults: object) -> Callable[..., None]:

@@ -545,6 +545,7 @@ class Camera:
                 size=self._size,
                 origin=self._origin,
                 image=image,
+                threads=torch.get_num_threads(),
             )
 
     def _shadow_maps(self, lights: WorldLights) -> ShadowMaps:
@@ -586,6 +587,7 @@ class Camera:
             albedo=buffers.albedo,
             normals=buffers.normals,
             depth=buffers.depth,
+            threads=torch.get_num_threads(),
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from arena_newton.kernels.launching import launch
+from arena_newton.kernels.launching import launch, launch_divided
 from arena_newton.kernels.pictures.raster import srgb
 
 __all__ = ["FULL_LIGHT", "launch_camera_poses", "launch_shade"]
@@ -95,6 +95,7 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
 
     @wp.kernel(enable_backward=False, module="unique")
     def shade(
+        first_row: wp.int32,
         first: wp.int32,
         view_world: wp.array[wp.int32],
         poses: wp.array[wp.transform],
@@ -113,6 +114,7 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
         image: wp.array4d[wp.uint8],
     ):
         number, row, column = wp.tid()
+        row += first_row
         view = first + number
         world = view_world[view]
         if world < 0:
@@ -169,6 +171,7 @@ def launch_shade(
     size: tuple[int, int],
     origin: tuple[int, int],
     image: wp.array,
+    threads: int = 1,
 ) -> None:
     """Shade the surfaces that each view's rays met; only distant lights have shadows.
 
@@ -190,7 +193,8 @@ def launch_shade(
         size: Height and width of the shaded part [px].
         origin: Row and column of its first pixel in `image` [px].
         image: Out, uint8 [views, rows, columns, 3].
+        threads: Threads on the CPU; their number changes no bit.
     """
     surfaces = [view_world, poses, rays, albedo, normals, depth, decode]
     inputs = [views[0], *surfaces, shadows, distant, direction, light, samples, *origin]
-    launch(_shade_kernel(*method), (views[1], *size), inputs, [image])
+    launch_divided(_shade_kernel(*method), (views[1], *size), 1, inputs, [image], threads)

@@ -5,7 +5,7 @@ Each triangle is drawn once into a depth buffer of 64-bit keys (nearness above, 
 
 import warp as wp
 
-from arena_newton.kernels.launching import launch
+from arena_newton.kernels.launching import launch, launch_divided
 
 __all__ = ["Soup", "launch_rasterize"]
 
@@ -105,6 +105,7 @@ def _clear(view_world: wp.array[wp.int32], nearest: wp.array3d[wp.uint64]):
 
 @wp.kernel(enable_backward=False)
 def _rasterize(
+    first_view: wp.int32,
     view_world: wp.array[wp.int32],
     poses: wp.array[wp.transform],
     soup: Soup,
@@ -113,6 +114,7 @@ def _rasterize(
     nearest: wp.array3d[wp.uint64],
 ):
     view, number = wp.tid()
+    view += first_view
     world = view_world[view]
     if world < 0:
         return
@@ -233,6 +235,7 @@ def _texel(soup: Soup, layout: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
 
 @wp.kernel(enable_backward=False)
 def _resolve(
+    first_row: wp.int32,
     view_world: wp.array[wp.int32],
     poses: wp.array[wp.transform],
     rays: wp.array4d[wp.vec3],
@@ -243,6 +246,7 @@ def _resolve(
     depth: wp.array3d[wp.float32],
 ):
     view, y, x = wp.tid()
+    y += first_row
     if view_world[view] < 0:
         return
     if nearest[view, y, x] == wp.uint64(0):
@@ -306,6 +310,7 @@ def launch_rasterize(
     albedo: wp.array,
     normals: wp.array,
     depth: wp.array,
+    threads: int = 1,
 ) -> None:
     """Albedo, normal and depth of the nearest triangle of each pixel.
 
@@ -322,7 +327,10 @@ def launch_rasterize(
         albedo: Out, sRGB packed as RGBA, uint32, same shape.
         normals: Out, world-space normals, same shape.
         depth: Out, distance along the ray [m], 0 where it met nothing, same shape.
+        threads: Threads on the CPU; their number changes no bit.
     """
     launch(_clear, nearest.shape, [view_world], [nearest])
-    launch(_rasterize, (poses.shape[0], triangles), [view_world, poses, soup, *tangents], [nearest])
-    launch(_resolve, depth.shape, [view_world, poses, rays, soup, nearest], [albedo, normals, depth])
+    inputs = [view_world, poses, soup, *tangents]
+    launch_divided(_rasterize, (poses.shape[0], triangles), 0, inputs, [nearest], threads)
+    inputs = [view_world, poses, rays, soup, nearest]
+    launch_divided(_resolve, depth.shape, 1, inputs, [albedo, normals, depth], threads)

@@ -145,3 +145,18 @@ def test_a_wrapper_takes_the_kernels_arguments():
     for wrong in ({}, {"round": True, "rond": True}):
         with pytest.raises(TypeError):
             launch_judge(height, **wrong, **outputs)
+
+
+@wp.kernel
+def _number(first: int, factor: float, out: wp.array2d[float]):
+    i, j = wp.tid()
+    j += first
+    out[i, j] += factor * float(10 * i + j + 1)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_a_divided_launch_is_one_launch(device, threads):
+    """Each index of the divided dimension is met once, whatever the number of threads."""
+    out = wp.zeros((2, 7), dtype=float, device=device)
+    launching.launch_divided(_number, (2, 7), 1, [2.0], [out], threads)
+    assert out.numpy().tolist() == [[2.0 * (10 * i + j + 1) for j in range(7)] for i in range(2)]
