@@ -14,13 +14,15 @@ from tests.made_packed import packed
 
 
 def test_the_policy_that_ships_is_compared_with_the_expert(tmp_path, monkeypatch, narrow):
-    """Ticks of both, in turn, as a ratio that is judged; the note says where the time of the one that sees goes."""
-    monkeypatch.setattr(learned_card, "SHIPPED", packed(tmp_path / "policy", ("boxing",)))
+    """Ticks of both, in turn, as a judged ratio for each task of its card; the note says where its time goes."""
+    monkeypatch.setattr(learned_card, "SHIPPED", packed(tmp_path / "policy", ("boxing", "vis_navi")))
     for name, value in (("WARM_UP", 2), ("ROUNDS", 1), ("WORLDS", (1,))):
         monkeypatch.setattr(bench_learned, name, value)
-    (figure,) = bench_learned.learned_figures(6)
-    assert figure.value > 0.0 and figure.bar == 2.0 and figure.verdict in ("pass", "MISS")
-    assert "boxing, 1 world" in figure.name and "pictures" in figure.note and "policy of the package" in figure.note
+    figures = list(bench_learned.learned_figures(6))
+    for task, figure in zip(("boxing", "vis_navi"), figures, strict=True):
+        assert figure.value > 0.0 and figure.bar == 2.0 and figure.verdict in ("pass", "MISS")
+        assert f"{task}, 1 world" in figure.name
+        assert "pictures" in figure.note and "policy of the package" in figure.note
 
 
 def test_a_gradient_is_counted_in_bare_ticks(monkeypatch):
