@@ -98,7 +98,7 @@ def main_colours(texture):
 
 
 def test_no_drawn_colour_is_one_of_semantic_modes():
-    """Each of the 4,096 colours that shapes may get differs from every colour and texture that only semantic mode shows."""
+    """Each of the 4,096 colours that shapes may get differs from every look that only semantic mode shows."""
     found = semantic_colours()
     assert {"brick.png", "tiles.png", "wood.png", "hazard.png", (0.05, 0.16, 0.38), (0.8, 0.22, 0.02)} <= set(found)
     drawn = palette(CPU).numpy()
