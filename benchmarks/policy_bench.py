@@ -12,7 +12,6 @@ import warp as wp
 from arena_newton import policies
 from arena_newton.errors import InputError
 from arena_newton.eval.bench.timing import WARM_UP, BenchFigure, RepeatedEpisodes
-from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.lerobot.checkpoint_facts import CheckpointFacts
 from arena_newton.policies.recipes.training_recipe import FAMILIES, recipe
 from arena_newton.policies.train.families import families
@@ -82,7 +81,6 @@ def _figure(options: PolicyBenchOptions, task: str, spec: str) -> BenchFigure:
     policy = policies.get(spec)
     policy.check()
     policy.check_task(task)
-    policy = read_by(policy, policy.labels or "v3.1")
     bench = RepeatedEpisodes(task, policy, count, cuda=cuda, checkpoint=options.twist2)
     budget = bench.env.budget
     steps = min(budget, TICKS.get(task, budget)) if random else budget

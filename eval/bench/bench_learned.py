@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from arena_newton import policies
 from arena_newton.eval.bench.timing import WARM_UP, BenchFigure, RepeatedEpisodes, cores
 from arena_newton.files.text import counted
-from arena_newton.policies.label_reader import read_by
 from arena_newton.policies.learned.learned_card import shipped_card
 
 __all__ = ["learned_figures"]
@@ -37,7 +36,7 @@ def learned_figures(ticks: int, checkpoint: str | None = None) -> Iterator[Bench
 def _figure(task: str, worlds: int, ticks: int, checkpoint: str | None) -> BenchFigure:
     seen = policies.get("learned")
     seen.check()
-    players = {"expert": policies.get("expert"), "learned": read_by(seen, seen.labels or "v3.1")}
+    players = {"expert": policies.get("expert"), "learned": seen}
     sides = {name: RepeatedEpisodes(task, one, worlds, checkpoint=checkpoint) for name, one in players.items()}
     spent: dict[str, list[float]] = {name: [] for name in sides}
     try:

@@ -17,7 +17,6 @@ from arena_newton.errors import ArenaError
 from arena_newton.eval.bench.timing import BenchFigure, RepeatedEpisodes
 from arena_newton.files.own_processes import environment
 from arena_newton.kernel_cache import kernel_loading
-from arena_newton.policies.label_reader import read_by
 
 __all__ = ["first_tick", "start_figures"]
 
@@ -50,7 +49,7 @@ def first_tick(worlds: int, threads: int, began: float) -> None:
     policy.check()
     part("policy")
     cuda = bool(wp.is_cuda_available())
-    side = RepeatedEpisodes("boxing", read_by(policy, policy.labels or "v3.1"), worlds, cuda=cuda)
+    side = RepeatedEpisodes("boxing", policy, worlds, cuda=cuda)
     part("environment")
     side.play(1)
     wp.synchronize()

@@ -20,6 +20,7 @@ from arena_newton.interfaces import Disturbance, EpisodeResult, Recorder
 from arena_newton.physics.devices import torch_threads
 from arena_newton.pictures.settings import policy_cameras
 from arena_newton.policies.base import Policy
+from arena_newton.policies.label_reader import read_by
 from arena_newton.rollout import Rollout
 from arena_newton.rules import seeding
 
@@ -145,12 +146,12 @@ class RepeatedEpisodes:
         """Plan the episodes and build the environment.
 
         Args:
-            policy: Policy; the pictures that it needs are rendered.
+            policy: Policy, read by the protocol that it answers; the pictures that it needs are rendered.
             worlds: Episodes at once; all when None.
             cuda: Engine warp on CUDA, instead of mujoco on the CPU.
             checkpoint: Weights of TWIST2; those of the package when None.
         """
-        self.policy = policy
+        self.policy = read_by(policy, policy.labels or "v3.1")
         self.episodes = episode_plan.expand(
             [task], trackers=["twist2"], policy="bench", seeds=seeds, repeats=repeats, seed_range=seed_range
         )
@@ -160,7 +161,7 @@ class RepeatedEpisodes:
             worlds=worlds or len(self.episodes),
             engine="warp" if cuda else "mujoco",
             device="cuda:0" if cuda else "cpu",
-            cameras=policy_cameras(policy),
+            cameras=policy_cameras(self.policy),
         )
 
     def play(

@@ -11,6 +11,7 @@ from pxr import Usd, UsdGeom, UsdShade
 from arena_newton.physics.scene import SCENES
 from arena_newton.pictures import changed_looks as looks
 from arena_newton.pictures.changed_looks import Changes, changed_looks, palette, recoloured, seen_colours, unlike
+from arena_newton.rules.modes import HELD_OUT
 from arena_newton.tasks.base import GOAL_OBJECT, KEY_OBJECT
 
 CPU = torch.device("cpu")
@@ -55,7 +56,7 @@ def semantic_colours():
     """
     found = {}
     for file in sorted(SCENES.glob("*/variants/*.usda")):
-        if file.stem[-1].isdigit():
+        if file.stem in HELD_OUT:
             continue
         shown = [bound(SCENES / file.parts[-3] / "scene.usda", name) for name in ("base", file.stem)]
         for look, prims in shown[1].items():
