@@ -23,7 +23,7 @@ from newton.sensors import SensorCamera
 from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from arena_newton.errors import InputError
-from arena_newton.kernels.pictures.lighting import launch_camera_poses, launch_shade
+from arena_newton.kernels.pictures.lighting import display_curve, launch_camera_poses, launch_shade
 from arena_newton.kernels.pictures.raster import launch_rasterize
 from arena_newton.kernels.pictures.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, CameraConfig, Fit
@@ -181,6 +181,7 @@ class _Tracer:
         self.occluders.transforms = model.bvh_shape_world_transforms
         self.occluders.meshes = model.shape_source_ptr
         self.decode = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=model.device)
+        self.curve = display_curve(model.device)
         self.soup, self.triangles, self.casters = triangles(model)
 
     @classmethod
@@ -538,6 +539,7 @@ class Camera:
                 normals=buffers.normals,
                 depth=buffers.depth,
                 decode=tracer.decode,
+                curve=tracer.curve,
                 distant=lights.distant,
                 direction=lights.direction,
                 light=lights.radiance,

@@ -9,7 +9,7 @@ from newton import Axis, GeoType, Mesh
 from newton.utils import load_texture, normalize_texture
 
 from arena_newton.errors import InputError
-from arena_newton.kernels.pictures.raster import Soup
+from arena_newton.kernels.pictures.raster import Soup, launch_albedo
 
 __all__ = ["srgb_to_linear", "triangles"]
 
@@ -125,12 +125,21 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     soup.shape, soup.face = array(entry_shape, wp.int32), array(entry_face, wp.int32)
     soup.large_end, soup.small_end = array(large, wp.int32), array(small, wp.int32)
     soup.scales, soup.transforms = array(scales, wp.vec3), model.bvh_shape_world_transforms
-    soup.colors = array(srgb_to_linear(model.shape_color.numpy()), wp.vec3)
-    soup.texture = array(texture, wp.int32)
+    colors = srgb_to_linear(model.shape_color.numpy()).astype(np.float32)
+    soup.colors, soup.texture = array(colors, wp.vec3), array(texture, wp.int32)
+    soup.packed = wp.zeros(len(colors), dtype=wp.uint32, device=model.device)
+    factors, curve = np.unique(colors[texture >= 0], return_inverse=True)
+    of_shape = np.zeros(colors.shape, np.int32)
+    of_shape[texture >= 0] = curve.reshape(-1, 3)
+    rows = 0 if model.device.is_cuda else len(factors)
+    soup.curve = array(of_shape, wp.vec3i)
+    soup.factors = array(np.stack([factors, factors ** (1 / 2.4)], axis=-1)[:rows], wp.vec2)
+    soup.levels = wp.zeros((rows, 256), dtype=wp.float32, device=model.device)
     soup.faces, soup.vertices = array(np.concatenate(faces), wp.vec3i), array(np.concatenate(vertices), wp.vec3)
     soup.normals, soup.uvs = array(np.concatenate(normals), wp.vec3), array(np.concatenate(uvs), wp.vec2)
     soup.texels = array(np.concatenate(texels) if texels else np.zeros(0, np.uint8), wp.uint8)
     soup.texture_layout = array(np.array(layouts, np.int32).reshape(-1, 3), wp.vec3i)
+    launch_albedo(soup)
     return soup, most(start[:-1], start[1:]), (most(start[:-1], large), most(large, small))
 
 

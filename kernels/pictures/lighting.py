@@ -18,9 +18,10 @@ from typing import Any
 import warp as wp
 
 from arena_newton.kernels.launching import launch, launch_divided
+from arena_newton.kernels.pictures.levels import LARGEST, as_float, settled
 from arena_newton.kernels.pictures.raster import srgb
 
-__all__ = ["FULL_LIGHT", "launch_camera_poses", "launch_shade"]
+__all__ = ["FULL_LIGHT", "DisplayCurve", "display_curve", "launch_camera_poses", "launch_shade"]
 
 FULL_LIGHT = 1700.0
 """Light intensity at 1 of the tone curve, which puts the original's dome (3000 · 0.75) at 1.32."""
@@ -84,6 +85,64 @@ def _byte(value: wp.float32) -> wp.uint8:
     return wp.uint8(wp.clamp(value, 0.0, 1.0) * 255.0 + 0.5)
 
 
+@wp.struct
+class DisplayCurve:
+    """Bytes of the display by table; without rows on CUDA, where powers are quick."""
+
+    levels: wp.array2d[wp.float32]
+    """Least radiance of each byte, shape [1, 256]."""
+    guesses: wp.array[wp.uint8]
+    """Byte of the first radiance of each of `GUESSES` steps: upper bits of a float, from those of `DARKEST` on."""
+
+
+GUESSES = wp.constant(4096)
+"""256 steps for each doubling of the radiance."""
+STEP_BITS = wp.constant(wp.uint32(15))
+"""Bits of a float within a step."""
+DARKEST = wp.constant(wp.uint32(0x3E800000))
+"""Bits of the radiance 0.25, below byte 1; 16 doublings later all is white."""
+
+
+@wp.func
+def _display_byte(radiance: wp.float32) -> wp.uint8:
+    return _byte(_display(radiance))
+
+
+@wp.kernel(enable_backward=False)
+def _fill_curve(curve: DisplayCurve):
+    number = wp.tid()
+    curve.guesses[number] = _display_byte(as_float(DARKEST + (wp.uint32(number) << STEP_BITS)))
+    if number > 255:
+        return
+    low = wp.uint32(0)
+    high = LARGEST
+    while low < high:
+        middle = low + (high - low) / wp.uint32(2)
+        if wp.int32(_display_byte(as_float(middle))) >= number:
+            high = middle
+        else:
+            low = middle + wp.uint32(1)
+    curve.levels[0, number] = as_float(low)
+
+
+def display_curve(device: wp.Device) -> DisplayCurve:
+    """The table of a device."""
+    curve = DisplayCurve()
+    rows = 0 if device.is_cuda else 1
+    curve.levels = wp.zeros((rows, 256), dtype=wp.float32, device=device)
+    curve.guesses = wp.zeros(rows * GUESSES, dtype=wp.uint8, device=device)
+    launch(_fill_curve, rows * GUESSES, [curve], [], device)
+    return curve
+
+
+@wp.func
+def _curved(curve: DisplayCurve, radiance: wp.float32) -> wp.uint8:
+    """Byte of a radiance, at least 0."""
+    step = wp.int32(wp.cast(radiance, wp.uint32) >> STEP_BITS) - wp.int32(DARKEST >> STEP_BITS)
+    guess = wp.int32(curve.guesses[wp.clamp(step, 0, GUESSES - 1)])
+    return wp.uint8(settled(curve.levels, 0, radiance, guess))
+
+
 @wp.func
 def _channel(packed: wp.uint32, shift: wp.uint32, decode: wp.array[wp.float32]) -> wp.float32:
     return decode[wp.int32((packed >> shift) & wp.uint32(0xFF))]
@@ -96,6 +155,8 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def shade(
         first_row: wp.int32,
+        lanes: wp.int32,
+        columns: wp.int32,
         first: wp.int32,
         view_world: wp.array[wp.int32],
         poses: wp.array[wp.transform],
@@ -104,6 +165,7 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
         normals: wp.array3d[wp.vec3],
         depth: wp.array3d[wp.float32],
         decode: wp.array[wp.float32],
+        curve: DisplayCurve,
         shadows: shadow_type,
         distant: wp.array[wp.int32],
         direction: wp.array[wp.vec3],
@@ -113,7 +175,7 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
         left: wp.int32,
         image: wp.array4d[wp.uint8],
     ):
-        number, row, column = wp.tid()
+        number, row, lane = wp.tid()
         row += first_row
         view = first + number
         world = view_world[view]
@@ -122,32 +184,39 @@ def _shade_kernel(shadow_type: Any, visibility: Any) -> wp.Kernel:
         mode = distant[world]
         to_light = -direction[world]
         radiant = light[world]
-        total = wp.vec3(0.0)
-        for k in range(samples * samples):
-            y = row * samples + k // samples
-            x = column * samples + k % samples
-            t = depth[view, y, x]
-            seen = radiant * wp.where(mode != 0, SKY_DISTANT, SKY_DOME)
-            if t > 0.0:
-                along = wp.transform_vector(poses[view], rays[y, x, 0, 1])
-                normal = normals[view, y, x]
-                if wp.dot(normal, along) > 0.0:
-                    normal = -normal
-                visible = wp.float32(1.0)
-                if mode != 0 and wp.dot(normal, to_light) > 0.0:
-                    point = wp.transform_point(poses[view], rays[y, x, 0, 0]) + along * t
-                    visible = visibility(shadows, number, world, point, normal, to_light)
-                packed = albedo[view, y, x]
-                colour = wp.vec3(
-                    _channel(packed, wp.uint32(0), decode),
-                    _channel(packed, wp.uint32(8), decode),
-                    _channel(packed, wp.uint32(16), decode),
-                )
-                seen = _radiance(colour, normal, mode, to_light, radiant, visible)
-            total += wp.vec3(_display(seen[0]), _display(seen[1]), _display(seen[2]))
-        total = total / wp.float32(samples * samples)
-        for c in range(3):
-            image[view, row + top, column + left, c] = _byte(total[c])
+        by_table = samples == 1 and curve.levels.shape[0] > 0
+        for column in range(lane, columns, lanes):
+            total = wp.vec3(0.0)
+            for k in range(samples * samples):
+                y = row * samples + k // samples
+                x = column * samples + k % samples
+                t = depth[view, y, x]
+                seen = radiant * wp.where(mode != 0, SKY_DISTANT, SKY_DOME)
+                if t > 0.0:
+                    along = wp.transform_vector(poses[view], rays[y, x, 0, 1])
+                    normal = normals[view, y, x]
+                    if wp.dot(normal, along) > 0.0:
+                        normal = -normal
+                    visible = wp.float32(1.0)
+                    if mode != 0 and wp.dot(normal, to_light) > 0.0:
+                        point = wp.transform_point(poses[view], rays[y, x, 0, 0]) + along * t
+                        visible = visibility(shadows, number, world, point, normal, to_light)
+                    packed = albedo[view, y, x]
+                    colour = wp.vec3(
+                        _channel(packed, wp.uint32(0), decode),
+                        _channel(packed, wp.uint32(8), decode),
+                        _channel(packed, wp.uint32(16), decode),
+                    )
+                    seen = _radiance(colour, normal, mode, to_light, radiant, visible)
+                if by_table:
+                    total = seen
+                else:
+                    total += wp.vec3(_display(seen[0]), _display(seen[1]), _display(seen[2]))
+            for c in range(3):
+                if by_table:
+                    image[view, row + top, column + left, c] = _curved(curve, total[c])
+                else:
+                    image[view, row + top, column + left, c] = _byte(total[c] / wp.float32(samples * samples))
 
     return shade
 
@@ -164,6 +233,7 @@ def launch_shade(
     normals: wp.array,
     depth: wp.array,
     decode: wp.array,
+    curve: DisplayCurve,
     distant: wp.array,
     direction: wp.array,
     light: wp.array,
@@ -186,6 +256,7 @@ def launch_shade(
         normals: World-space normals, same shape.
         depth: Distance along the ray [m], 0 where it met nothing, same shape.
         decode: Linear value of each sRGB byte, float32 [256].
+        curve: Of `display_curve`; one without rows computes the same bytes by powers.
         distant: int32 [worlds], 1 for a distant light, 0 for a dome.
         direction: Unit vector from the light to the scene, shape [worlds].
         light: Intensity times colour, shape [worlds].
@@ -195,6 +266,7 @@ def launch_shade(
         image: Out, uint8 [views, rows, columns, 3].
         threads: Threads on the CPU; their number changes no bit.
     """
-    surfaces = [view_world, poses, rays, albedo, normals, depth, decode]
-    inputs = [views[0], *surfaces, shadows, distant, direction, light, samples, *origin]
-    launch_divided(_shade_kernel(*method), (views[1], *size), 1, inputs, [image], threads)
+    surfaces = [view_world, poses, rays, albedo, normals, depth, decode, curve]
+    lanes = size[1] if image.device.is_cuda else 1  # copying the arguments takes as long as a pixel on the CPU
+    inputs = [lanes, size[1], views[0], *surfaces, shadows, distant, direction, light, samples, *origin]
+    launch_divided(_shade_kernel(*method), (views[1], size[0], lanes), 1, inputs, [image], threads)

@@ -6,8 +6,9 @@ Each triangle is drawn once into a depth buffer of 64-bit keys (nearness above, 
 import warp as wp
 
 from arena_newton.kernels.launching import launch, launch_divided
+from arena_newton.kernels.pictures.levels import LARGEST, as_float, settled
 
-__all__ = ["Soup", "launch_rasterize"]
+__all__ = ["Soup", "launch_albedo", "launch_rasterize"]
 
 NEAR = wp.constant(wp.float32(0.002))
 """Smallest distance from the camera's plane at which a surface is drawn [m]."""
@@ -38,6 +39,15 @@ class Soup:
     """World pose of each shape [m]."""
     colors: wp.array[wp.vec3]
     """Linear albedo of each shape."""
+    packed: wp.array[wp.uint32]
+    """The same as sRGB, packed as RGBA."""
+    curve: wp.array[wp.vec3i]
+    """Row in `levels` of each channel of each shape; read where it has a texture."""
+    factors: wp.array[wp.vec2]
+    """Linear albedo of each row of `levels`, and its power 1 / 2.4."""
+    levels: wp.array2d[wp.float32]
+    """Least sRGB value in a texture that gives each byte, under each factor, shape [rows, 256]; no rows on CUDA, where
+    powers are quick."""
     texture: wp.array[wp.int32]
     """Texture of each shape, −1 for none."""
     faces: wp.array[wp.vec3i]
@@ -220,22 +230,76 @@ def _linear(value: wp.float32) -> wp.float32:
 
 
 @wp.func
-def _texel(soup: Soup, layout: wp.vec3i, x: wp.int32, y: wp.int32) -> wp.vec3:
-    """Texel as sRGB in [0, 1], repeating."""
-    column = x % layout[1]
-    row = y % layout[2]
-    if column < 0:
-        column += layout[1]
-    if row < 0:
-        row += layout[2]
-    i = (layout[0] + row * layout[1] + column) * 3
+def _albedo_byte(value: wp.float32) -> wp.uint32:
+    """Byte of a linear albedo in sRGB, rounded down."""
+    return wp.uint32(wp.clamp(srgb(value), 0.0, 1.0) * 255.0)
+
+
+@wp.func
+def _pack(red: wp.uint32, green: wp.uint32, blue: wp.uint32) -> wp.uint32:
+    return red | (green << wp.uint32(8)) | (blue << wp.uint32(16))
+
+
+@wp.kernel(enable_backward=False)
+def _pack_colors(soup: Soup):
+    shape = wp.tid()
+    colour = soup.colors[shape]
+    soup.packed[shape] = _pack(_albedo_byte(colour[0]), _albedo_byte(colour[1]), _albedo_byte(colour[2]))
+
+
+@wp.kernel(enable_backward=False)
+def _fill_levels(soup: Soup):
+    row, byte = wp.tid()
+    low = wp.uint32(0)
+    high = LARGEST
+    while low < high:
+        middle = low + (high - low) / wp.uint32(2)
+        if _albedo_byte(soup.factors[row][0] * _linear(as_float(middle))) >= wp.uint32(byte):
+            high = middle
+        else:
+            low = middle + wp.uint32(1)
+    soup.levels[row, byte] = as_float(low)
+
+
+@wp.func
+def _texture_byte(soup: Soup, row: wp.int32, seen: wp.float32) -> wp.uint32:
+    straight = soup.factors[row][1] * (seen + 0.055) - 0.055  # but for dark values
+    return settled(soup.levels, row, seen, wp.int32(straight * 255.0))
+
+
+@wp.func
+def _textured(soup: Soup, shape: wp.int32, seen: wp.vec3) -> wp.uint32:
+    """Packed albedo of a shape where its texture has an sRGB value, in [0, 1]."""
+    if soup.levels.shape[0] == 0:
+        colour = wp.cw_mul(soup.colors[shape], wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
+        return _pack(_albedo_byte(colour[0]), _albedo_byte(colour[1]), _albedo_byte(colour[2]))
+    rows = soup.curve[shape]
+    red = _texture_byte(soup, rows[0], seen[0])
+    green = _texture_byte(soup, rows[1], seen[1])
+    return _pack(red, green, _texture_byte(soup, rows[2], seen[2]))
+
+
+@wp.func
+def _texel(soup: Soup, texel: wp.int32) -> wp.vec3:
+    """Texel as sRGB in [0, 1]."""
+    i = texel * 3
     scale = 1.0 / 255.0
     return wp.vec3(wp.float32(soup.texels[i]), wp.float32(soup.texels[i + 1]), wp.float32(soup.texels[i + 2])) * scale
+
+
+@wp.func
+def _wrapped(index: wp.int32, count: wp.int32) -> wp.int32:
+    """Row or column of a texture that repeats."""
+    rest = index % count
+    if rest < 0:
+        rest += count
+    return rest
 
 
 @wp.kernel(enable_backward=False)
 def _resolve(
     first_row: wp.int32,
+    lanes: wp.int32,
     view_world: wp.array[wp.int32],
     poses: wp.array[wp.transform],
     rays: wp.array4d[wp.vec3],
@@ -245,57 +309,63 @@ def _resolve(
     normals: wp.array3d[wp.vec3],
     depth: wp.array3d[wp.float32],
 ):
-    view, y, x = wp.tid()
+    view, y, lane = wp.tid()
     y += first_row
     if view_world[view] < 0:
         return
-    if nearest[view, y, x] == wp.uint64(0):
-        depth[view, y, x] = 0.0
-        return
-    entry = wp.int32(nearest[view, y, x] & wp.uint64(0xFFFFFFFF))
-    shape = soup.shape[entry]
-    pose = soup.transforms[shape]
-    inverse = wp.transform_inverse(pose)
-    # The ray in the shape's frame, where the triangle needs no transform.
-    start = wp.transform_point(inverse, wp.transform_get_translation(poses[view]))
-    along = wp.transform_vector(inverse, wp.transform_vector(poses[view], rays[y, x, 0, 1]))
-    corners = soup.faces[soup.face[entry]]
-    scale = soup.scales[shape]
-    p0 = wp.cw_mul(scale, soup.vertices[corners[0]]) - start
-    p1 = wp.cw_mul(scale, soup.vertices[corners[1]]) - start
-    p2 = wp.cw_mul(scale, soup.vertices[corners[2]]) - start
-    normal = wp.cross(p1 - p0, p2 - p0)
-    t = wp.dot(normal, p0) / wp.dot(normal, along)
-    # Weights from the triangle's own edges around the hit point; outside by rounding at most.
-    hit = along * t
-    square = wp.dot(normal, normal)
-    w1 = wp.clamp(wp.dot(wp.cross(p2 - hit, p0 - hit), normal) / square, 0.0, 1.0)
-    w2 = wp.clamp(wp.dot(wp.cross(p0 - hit, p1 - hit), normal) / square, 0.0, 1.0)
-    w0 = wp.max(1.0 - w1 - w2, 0.0)
-    smooth = soup.normals[corners[0]] * w0 + soup.normals[corners[1]] * w1 + soup.normals[corners[2]] * w2
-    if wp.dot(smooth, smooth) > 0.0:
-        normal = wp.cw_div(smooth, scale)
-    colour = soup.colors[shape]
-    if soup.texture[shape] >= 0:
-        layout = soup.texture_layout[soup.texture[shape]]
-        uv = soup.uvs[corners[0]] * w0 + soup.uvs[corners[1]] * w1 + soup.uvs[corners[2]] * w2
-        u = uv[0] * wp.float32(layout[1]) - 0.5
-        v = (1.0 - uv[1]) * wp.float32(layout[2]) - 0.5
-        column = wp.int32(wp.floor(u))
-        row = wp.int32(wp.floor(v))
-        fu = u - wp.floor(u)
-        fv = v - wp.floor(v)
-        above = _texel(soup, layout, column, row) * (1.0 - fu) + _texel(soup, layout, column + 1, row) * fu
-        below = _texel(soup, layout, column, row + 1) * (1.0 - fu) + _texel(soup, layout, column + 1, row + 1) * fu
-        seen = above * (1.0 - fv) + below * fv
-        colour = wp.cw_mul(colour, wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
-    albedo[view, y, x] = (
-        wp.uint32(wp.clamp(srgb(colour[0]), 0.0, 1.0) * 255.0)
-        | (wp.uint32(wp.clamp(srgb(colour[1]), 0.0, 1.0) * 255.0) << wp.uint32(8))
-        | (wp.uint32(wp.clamp(srgb(colour[2]), 0.0, 1.0) * 255.0) << wp.uint32(16))
-    )
-    normals[view, y, x] = wp.normalize(wp.transform_vector(pose, normal))
-    depth[view, y, x] = t
+    for x in range(lane, depth.shape[2], lanes):
+        if nearest[view, y, x] == wp.uint64(0):
+            depth[view, y, x] = 0.0
+            continue
+        entry = wp.int32(nearest[view, y, x] & wp.uint64(0xFFFFFFFF))
+        shape = soup.shape[entry]
+        pose = soup.transforms[shape]
+        inverse = wp.transform_inverse(pose)
+        # The ray in the shape's frame, where the triangle needs no transform.
+        start = wp.transform_point(inverse, wp.transform_get_translation(poses[view]))
+        along = wp.transform_vector(inverse, wp.transform_vector(poses[view], rays[y, x, 0, 1]))
+        corners = soup.faces[soup.face[entry]]
+        scale = soup.scales[shape]
+        p0 = wp.cw_mul(scale, soup.vertices[corners[0]]) - start
+        p1 = wp.cw_mul(scale, soup.vertices[corners[1]]) - start
+        p2 = wp.cw_mul(scale, soup.vertices[corners[2]]) - start
+        normal = wp.cross(p1 - p0, p2 - p0)
+        t = wp.dot(normal, p0) / wp.dot(normal, along)
+        # Weights from the triangle's own edges around the hit point; outside by rounding at most.
+        hit = along * t
+        square = wp.dot(normal, normal)
+        w1 = wp.clamp(wp.dot(wp.cross(p2 - hit, p0 - hit), normal) / square, 0.0, 1.0)
+        w2 = wp.clamp(wp.dot(wp.cross(p0 - hit, p1 - hit), normal) / square, 0.0, 1.0)
+        w0 = wp.max(1.0 - w1 - w2, 0.0)
+        smooth = soup.normals[corners[0]] * w0 + soup.normals[corners[1]] * w1 + soup.normals[corners[2]] * w2
+        if wp.dot(smooth, smooth) > 0.0:
+            normal = wp.cw_div(smooth, scale)
+        colour = soup.packed[shape]
+        if soup.texture[shape] >= 0:
+            layout = soup.texture_layout[soup.texture[shape]]
+            uv = soup.uvs[corners[0]] * w0 + soup.uvs[corners[1]] * w1 + soup.uvs[corners[2]] * w2
+            u = uv[0] * wp.float32(layout[1]) - 0.5
+            v = (1.0 - uv[1]) * wp.float32(layout[2]) - 0.5
+            column = _wrapped(wp.int32(wp.floor(u)), layout[1])
+            row = _wrapped(wp.int32(wp.floor(v)), layout[2])
+            right = wp.where(column + 1 == layout[1], 0, column + 1)
+            upper = layout[0] + row * layout[1]
+            lower = layout[0] + wp.where(row + 1 == layout[2], 0, row + 1) * layout[1]
+            fu = u - wp.floor(u)
+            fv = v - wp.floor(v)
+            above = _texel(soup, upper + column) * (1.0 - fu) + _texel(soup, upper + right) * fu
+            below = _texel(soup, lower + column) * (1.0 - fu) + _texel(soup, lower + right) * fu
+            seen = above * (1.0 - fv) + below * fv
+            colour = _textured(soup, shape, seen)
+        albedo[view, y, x] = colour
+        normals[view, y, x] = wp.normalize(wp.transform_vector(pose, normal))
+        depth[view, y, x] = t
+
+
+def launch_albedo(soup: Soup) -> None:
+    """Fill `packed` and `levels`, which have memory, by what the soup says besides; once, as neither changes."""
+    launch(_pack_colors, soup.packed.shape, [soup], [], soup.packed.device)
+    launch(_fill_levels, soup.levels.shape, [soup], [], soup.packed.device)
 
 
 def launch_rasterize(
@@ -332,5 +402,6 @@ def launch_rasterize(
     launch(_clear, nearest.shape, [view_world], [nearest])
     inputs = [view_world, poses, soup, *tangents]
     launch_divided(_rasterize, (poses.shape[0], triangles), 0, inputs, [nearest], threads)
-    inputs = [view_world, poses, rays, soup, nearest]
-    launch_divided(_resolve, depth.shape, 1, inputs, [albedo, normals, depth], threads)
+    lanes = depth.shape[2] if depth.device.is_cuda else 1  # copying the arguments takes as long as a pixel on the CPU
+    inputs = [lanes, view_world, poses, rays, soup, nearest]
+    launch_divided(_resolve, (*depth.shape[:2], lanes), 1, inputs, [albedo, normals, depth], threads)

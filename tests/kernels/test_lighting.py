@@ -100,6 +100,7 @@ def test_masked_view_keeps_its_picture():
             normals=wp.zeros((1, 2, 2), dtype=wp.vec3, device="cpu"),
             depth=one,
             decode=wp.zeros(256, dtype=wp.float32, device="cpu"),
+            curve=lighting.DisplayCurve(),
             distant=wp.zeros(1, dtype=wp.int32, device="cpu"),
             direction=wp.zeros(1, dtype=wp.vec3, device="cpu"),
             light=wp.array([[1e5, 1e5, 1e5]], dtype=wp.vec3, device="cpu"),
@@ -109,6 +110,28 @@ def test_masked_view_keeps_its_picture():
             image=image,
         )
         assert (image.numpy() == expected).all()
+
+
+@wp.kernel(enable_backward=False)
+def _bytes(curve: lighting.DisplayCurve, radiance: wp.array[wp.float32], found: wp.array2d[wp.uint8]):
+    at = wp.tid()
+    found[0, at] = lighting._curved(curve, radiance[at])
+    found[1, at] = lighting._display_byte(radiance[at])
+
+
+def test_bytes_of_the_display_by_table_are_those_of_powers():
+    """Radiances around every level, of any size, and many between, give the byte that the formula gives."""
+    curve = lighting.display_curve(wp.get_device("cpu"))
+    levels = curve.levels.numpy()[0]
+    assert (np.diff(levels) > 0).all()
+    near = (levels.view(np.int32)[:, None] + np.arange(-40, 41)).clip(0).astype(np.int32).view(np.float32).ravel()
+    between = np.random.default_rng(7).uniform(0, 12_000, 100_000).astype(np.float32)
+    values = np.concatenate([near, between, np.float32([0, 1e-38, 0.2, 1e5, 3e38])])
+    found = wp.zeros((2, len(values)), dtype=wp.uint8, device="cpu")
+    wp.launch(_bytes, dim=len(values), inputs=[curve, wp.array(values, device="cpu")], outputs=[found], device="cpu")
+    table, formula = found.numpy()
+    assert (table == formula).all()
+    assert (formula.min(), formula.max()) == (0, 255)
 
 
 def test_histograms_count_every_pixel_of_chosen_worlds():

@@ -27,6 +27,9 @@ def _soup(vertices, faces, color):
     soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
     soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
     soup.texture_layout = array(np.zeros((0, 3), np.int32), wp.vec3i)
+    soup.packed = wp.zeros(1, dtype=wp.uint32, device="cpu")
+    soup.levels = wp.zeros((0, 256), dtype=wp.float32, device="cpu")
+    raster.launch_albedo(soup)
     return soup
 
 
@@ -140,3 +143,30 @@ def test_a_shadow_map_holds_the_highest_surface():
     expected = np.where(np.isfinite(best), best + 256.0, 0.0)
     assert (np.abs(found - expected) < 2e-3).mean() > 0.995
     assert 0.2 < np.isfinite(best).mean() < 1.0
+
+
+@wp.kernel(enable_backward=False)
+def _bytes(soup: raster.Soup, values: wp.array[wp.float32], found: wp.array3d[wp.uint32]):
+    row, at = wp.tid()
+    found[0, row, at] = raster._texture_byte(soup, row, values[at])
+    found[1, row, at] = raster._albedo_byte(soup.factors[row][0] * raster._linear(values[at]))
+
+
+def test_bytes_of_textures_by_table_are_those_of_powers():
+    """Values around every level, and many between, give the byte of the powers, under dark and bright colours."""
+    soup = _soup(np.zeros((1, 3)), [[0, 0, 0]], (0.25, 0.5, 1.0))
+    factors = np.array([0.0, 1e-4, 0.003, 0.02, 0.2, 0.5, 0.97, 1.0], np.float32)
+    soup.factors = wp.array(np.stack([factors, factors ** (1 / 2.4)], axis=-1), dtype=wp.vec2, device="cpu")
+    soup.levels = wp.zeros((len(factors), 256), dtype=wp.float32, device="cpu")
+    raster.launch_albedo(soup)
+    levels = soup.levels.numpy()
+    assert (np.diff(levels, axis=1) >= 0).all()
+    reached = levels[levels <= 1.0]
+    assert len(np.unique(reached)) > 500
+    near = (reached.view(np.int32)[:, None] + np.arange(-8, 9)).clip(0).astype(np.int32).view(np.float32).ravel()
+    values = np.concatenate([near, np.random.default_rng(6).random(20_000, np.float32), np.float32([0, 1])])
+    found = wp.zeros((2, len(factors), len(values)), dtype=wp.uint32, device="cpu")
+    wp.launch(_bytes, dim=found.shape[1:], inputs=[soup, wp.array(values, device="cpu")], outputs=[found], device="cpu")
+    table, powers = found.numpy()
+    assert (table == powers).all()
+    assert powers.max() >= 254
