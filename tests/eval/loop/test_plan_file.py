@@ -53,9 +53,14 @@ def test_the_generalist_plays_every_cell(tmp_path):
 def test_a_row_of_one_task_and_tracker_has_its_demonstrations_alone(tmp_path):
     """Each of the fourteen is trained on its own dataset, which it waits for, and packed for its task."""
     plan = read_plan("singles")
-    assert {(row.tasks, row.trackers) for row in plan.rows} == {
+    singles, merged = plan.rows[:-1], plan.rows[-1]
+    assert {(row.tasks, row.trackers) for row in singles} == {
         ((task,), (tracker,)) for task in plan.attempts for tracker in plan.record.tracker
     }
+    samples = {row.tasks[0]: row.train.steps * row.train.batch_size for row in singles}
+    weights = {task: float(weight) for task, weight in (one.split("=") for one in merged.train.task_weights)}
+    assert 2 * sum(samples.values()) == merged.train.steps * merged.train.batch_size
+    assert {task: count / 64_000 for task, count in samples.items()} == weights
     commands = made(plan, tmp_path, rows=[plan.row("boxing-sonic")], seeds=[1])
     training = commands["train boxing-sonic_1"]
     words = training.words()
