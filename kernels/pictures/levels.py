@@ -25,7 +25,7 @@ def settled(levels: wp.array2d[wp.float32], row: wp.int32, value: wp.float32, gu
     Args:
         levels: Least value of each byte, shape [rows, 256].
         row: Curve of the value.
-        value: At least 0.
+        value: At least 0, no NaN.
         guess: Where the search begins, any number.
     """
     byte = wp.clamp(guess, 0, 255)

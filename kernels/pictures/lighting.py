@@ -137,7 +137,7 @@ def display_curve(device: wp.Device) -> DisplayCurve:
 
 @wp.func
 def _curved(curve: DisplayCurve, radiance: wp.float32) -> wp.uint8:
-    """Byte of a radiance, at least 0."""
+    """Byte of a radiance, at least 0 and no NaN."""
     step = wp.int32(wp.cast(radiance, wp.uint32) >> STEP_BITS) - wp.int32(DARKEST >> STEP_BITS)
     guess = wp.int32(curve.guesses[wp.clamp(step, 0, GUESSES - 1)])
     return wp.uint8(settled(curve.levels, 0, radiance, guess))

@@ -41,13 +41,9 @@ class Soup:
     """Linear albedo of each shape."""
     packed: wp.array[wp.uint32]
     """The same as sRGB, packed as RGBA."""
-    curve: wp.array[wp.vec3i]
-    """Row in `levels` of each channel of each shape; read where it has a texture."""
-    factors: wp.array[wp.vec2]
-    """Linear albedo of each row of `levels`, and its power 1 / 2.4."""
     levels: wp.array2d[wp.float32]
-    """Least sRGB value in a texture that gives each byte, under each factor, shape [rows, 256]; no rows on CUDA, where
-    powers are quick."""
+    """Least sRGB value in a white shape's texture that gives each byte, shape [1, 256]; no rows on CUDA, where powers
+    are quick."""
     texture: wp.array[wp.int32]
     """Texture of each shape, −1 for none."""
     faces: wp.array[wp.vec3i]
@@ -249,34 +245,32 @@ def _pack_colors(soup: Soup):
 
 @wp.kernel(enable_backward=False)
 def _fill_levels(soup: Soup):
-    row, byte = wp.tid()
+    byte = wp.tid()
     low = wp.uint32(0)
     high = LARGEST
     while low < high:
         middle = low + (high - low) / wp.uint32(2)
-        if _albedo_byte(soup.factors[row][0] * _linear(as_float(middle))) >= wp.uint32(byte):
+        if _albedo_byte(_linear(as_float(middle))) >= wp.uint32(byte):
             high = middle
         else:
             low = middle + wp.uint32(1)
-    soup.levels[row, byte] = as_float(low)
+    soup.levels[0, byte] = as_float(low)
 
 
 @wp.func
-def _texture_byte(soup: Soup, row: wp.int32, seen: wp.float32) -> wp.uint32:
-    straight = soup.factors[row][1] * (seen + 0.055) - 0.055  # but for dark values
-    return settled(soup.levels, row, seen, wp.int32(straight * 255.0))
+def _texture_byte(soup: Soup, seen: wp.float32) -> wp.uint32:
+    return settled(soup.levels, 0, seen, wp.int32(seen * 255.0))
 
 
 @wp.func
 def _textured(soup: Soup, shape: wp.int32, seen: wp.vec3) -> wp.uint32:
     """Packed albedo of a shape where its texture has an sRGB value, in [0, 1]."""
-    if soup.levels.shape[0] == 0:
-        colour = wp.cw_mul(soup.colors[shape], wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
+    colour = soup.colors[shape]
+    white = colour == wp.vec3(1.0)
+    if soup.levels.shape[0] == 0 or not white:
+        colour = wp.cw_mul(colour, wp.vec3(_linear(seen[0]), _linear(seen[1]), _linear(seen[2])))
         return _pack(_albedo_byte(colour[0]), _albedo_byte(colour[1]), _albedo_byte(colour[2]))
-    rows = soup.curve[shape]
-    red = _texture_byte(soup, rows[0], seen[0])
-    green = _texture_byte(soup, rows[1], seen[1])
-    return _pack(red, green, _texture_byte(soup, rows[2], seen[2]))
+    return _pack(_texture_byte(soup, seen[0]), _texture_byte(soup, seen[1]), _texture_byte(soup, seen[2]))
 
 
 @wp.func
@@ -365,7 +359,7 @@ def _resolve(
 def launch_albedo(soup: Soup) -> None:
     """Fill `packed` and `levels`, which have memory, by what the soup says besides; once, as neither changes."""
     launch(_pack_colors, soup.packed.shape, [soup], [], soup.packed.device)
-    launch(_fill_levels, soup.levels.shape, [soup], [], soup.packed.device)
+    launch(_fill_levels, soup.levels.size, [soup], [], soup.packed.device)
 
 
 def launch_rasterize(

@@ -144,6 +144,8 @@ def test_samples_smooth_edges(model):
     lights = WorldLights.allocate(WORLDS, "cpu")
     hard = _camera(model, lights).render(model.state()).numpy()[0].astype(float)
     soft = _camera(model, lights, samples=3).render(model.state()).numpy()[0].astype(float)
+    fine = _camera(model, lights, 240, 180).render(model.state()).numpy()[0].reshape(60, 3, 80, 3, 3).mean(axis=(1, 3))
+    assert abs(fine - soft).max() <= 1
     assert abs(hard.mean() - soft.mean()) < 2
     assert len(np.unique(soft.reshape(-1, 3), axis=0)) > len(np.unique(hard.reshape(-1, 3), axis=0))
 

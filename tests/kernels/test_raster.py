@@ -1,6 +1,7 @@
 """Promises of the kernels that draw triangles, from the camera and from the light."""
 
 import numpy as np
+import pytest
 import warp as wp
 
 from arena_newton.kernels.pictures import raster, shadow
@@ -11,7 +12,7 @@ def srgb(value):
     return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055)
 
 
-def _soup(vertices, faces, color):
+def _soup(vertices, faces, color, uvs=None, texels=None, table=True):
     soup = raster.Soup()
 
     def array(values, kind):
@@ -22,18 +23,20 @@ def _soup(vertices, faces, color):
     soup.shape, soup.face = array(np.zeros(len(faces)), wp.int32), array(np.arange(len(faces)), wp.int32)
     soup.bounds, soup.scales = array([[0, 0, 0, 1e3]], wp.vec4), array([[1, 1, 1]], wp.vec3)
     soup.transforms = array([[0, 0, 0, 0, 0, 0, 1]], wp.transform)
-    soup.colors, soup.texture = array([color], wp.vec3), array([-1], wp.int32)
+    soup.colors, soup.texture = array([color], wp.vec3), array([-1 if texels is None else 0], wp.int32)
     soup.faces, soup.vertices = array(faces, wp.vec3i), array(vertices, wp.vec3)
-    soup.normals, soup.uvs = array(np.zeros((len(vertices), 3)), wp.vec3), array(np.zeros((len(vertices), 2)), wp.vec2)
-    soup.texels = array(np.zeros(0, np.uint8), wp.uint8)
-    soup.texture_layout = array(np.zeros((0, 3), np.int32), wp.vec3i)
+    soup.normals = array(np.zeros((len(vertices), 3)), wp.vec3)
+    soup.uvs = array(np.zeros((len(vertices), 2)) if uvs is None else uvs, wp.vec2)
+    texels = np.zeros((0, 0, 3), np.uint8) if texels is None else texels
+    soup.texels = array(texels.ravel(), wp.uint8)
+    soup.texture_layout = array([[0, texels.shape[1], texels.shape[0]]], wp.vec3i)
     soup.packed = wp.zeros(1, dtype=wp.uint32, device="cpu")
-    soup.levels = wp.zeros((0, 256), dtype=wp.float32, device="cpu")
+    soup.levels = wp.zeros((int(table), 256), dtype=wp.float32, device="cpu")
     raster.launch_albedo(soup)
     return soup
 
 
-def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
+def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48, color=(0.25, 0.5, 1.0), **texture):
     x = (np.arange(width) + 0.5) / width * 2 - 1
     y = 1 - (np.arange(height) + 0.5) / height * 2
     rays = np.zeros((height, width, 1, 2, 3), np.float32)
@@ -44,11 +47,12 @@ def _draw(vertices, faces, tangents=(1.0, 0.75), width=64, height=48):
         return wp.zeros((1, height, width), dtype=kind, device="cpu")
 
     out = {"albedo": empty(wp.uint32), "normals": empty(wp.vec3), "depth": empty(wp.float32)}
+    out["depth"].fill_(7.0)  # of an earlier picture
     raster.launch_rasterize(
         view_world=wp.zeros(1, dtype=wp.int32, device="cpu"),
         poses=wp.array([[0, 0, 0, 0, 0, 0, 1]], dtype=wp.transform, device="cpu"),
         rays=wp.array(rays, dtype=wp.vec3, device="cpu"),
-        soup=_soup(vertices, faces, (0.25, 0.5, 1.0)),
+        soup=_soup(vertices, faces, color, **texture),
         tangents=tangents,
         triangles=len(faces),
         nearest=empty(wp.uint64),
@@ -73,6 +77,7 @@ def test_drawn_triangles_meet_the_rays():
         v, t = d @ q / det, q @ (p2 - p0) / det
         hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t * -d[..., 2] > 0.002)
         best = np.where(hit & (t < best), t, best)
+    assert (out["depth"] != 7.0).all()
     found = np.where(out["depth"] > 0, out["depth"], np.inf)
     same = (found == best) | (np.abs(found - best) < 1e-3 * np.maximum(1, best))
     assert same.mean() > 0.995
@@ -146,27 +151,46 @@ def test_a_shadow_map_holds_the_highest_surface():
 
 
 @wp.kernel(enable_backward=False)
-def _bytes(soup: raster.Soup, values: wp.array[wp.float32], found: wp.array3d[wp.uint32]):
-    row, at = wp.tid()
-    found[0, row, at] = raster._texture_byte(soup, row, values[at])
-    found[1, row, at] = raster._albedo_byte(soup.factors[row][0] * raster._linear(values[at]))
+def _bytes(soup: raster.Soup, values: wp.array[wp.float32], found: wp.array2d[wp.uint32]):
+    at = wp.tid()
+    found[0, at] = raster._texture_byte(soup, values[at])
+    found[1, at] = raster._albedo_byte(raster._linear(values[at]))
 
 
 def test_bytes_of_textures_by_table_are_those_of_powers():
-    """Values around every level, and many between, give the byte of the powers, under dark and bright colours."""
-    soup = _soup(np.zeros((1, 3)), [[0, 0, 0]], (0.25, 0.5, 1.0))
-    factors = np.array([0.0, 1e-4, 0.003, 0.02, 0.2, 0.5, 0.97, 1.0], np.float32)
-    soup.factors = wp.array(np.stack([factors, factors ** (1 / 2.4)], axis=-1), dtype=wp.vec2, device="cpu")
-    soup.levels = wp.zeros((len(factors), 256), dtype=wp.float32, device="cpu")
-    raster.launch_albedo(soup)
-    levels = soup.levels.numpy()
-    assert (np.diff(levels, axis=1) >= 0).all()
-    reached = levels[levels <= 1.0]
-    assert len(np.unique(reached)) > 500
-    near = (reached.view(np.int32)[:, None] + np.arange(-8, 9)).clip(0).astype(np.int32).view(np.float32).ravel()
-    values = np.concatenate([near, np.random.default_rng(6).random(20_000, np.float32), np.float32([0, 1])])
-    found = wp.zeros((2, len(factors), len(values)), dtype=wp.uint32, device="cpu")
-    wp.launch(_bytes, dim=found.shape[1:], inputs=[soup, wp.array(values, device="cpu")], outputs=[found], device="cpu")
+    """Values around every level, and many between, give the byte of the powers."""
+    soup = _soup(np.zeros((1, 3)), [[0, 0, 0]], (1.0, 1.0, 1.0))
+    levels = soup.levels.numpy()[0, :255]
+    assert (np.diff(levels) > 0).all()
+    near = (levels.view(np.int32)[:, None] + np.arange(-20, 21)).clip(0).astype(np.int32).view(np.float32).ravel()
+    values = np.concatenate([near, np.random.default_rng(6).random(100_000, np.float32), np.float32([0, 1])])
+    found = wp.zeros((2, len(values)), dtype=wp.uint32, device="cpu")
+    wp.launch(_bytes, dim=len(values), inputs=[soup, wp.array(values, device="cpu")], outputs=[found], device="cpu")
     table, powers = found.numpy()
     assert (table == powers).all()
-    assert powers.max() >= 254
+    assert (powers.min(), powers.max()) == (0, 254)
+
+
+@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.25, 0.5, 1.0)])
+def test_textures_repeat_and_blend(color):
+    """A wall that a texture of 3 rows and 5 columns covers several times shows its texels blended, and tinted."""
+    texels = np.random.default_rng(8).integers(0, 256, (3, 5, 3), np.uint8)
+    corners = np.array([[-3, -2.5, -2], [3, -2.5, -2], [3, 2.5, -2], [-3, 2.5, -2]], np.float32)
+    low, size = np.array([-3.7, -1.2]), np.array([5.8, 3.5])
+    uvs = low + size * (corners[:, :2] + [3, 2.5]) / [6, 5]
+    texture = {"color": color, "uvs": uvs, "texels": texels}
+    rays, out = _draw(corners, np.array([[0, 1, 2], [0, 2, 3]]), **texture)
+    u, v = np.moveaxis(low + size * (rays[..., :2] * 2 / -rays[..., 2:] + [3, 2.5]) / [6, 5], -1, 0)
+    column, row = u * 5 - 0.5, (1 - v) * 3 - 0.5
+    seen = np.zeros((*column.shape, 3))
+    for right in (0, 1):
+        for lower in (0, 1):
+            i, j = np.floor(row).astype(int) + lower, np.floor(column).astype(int) + right
+            weight = (1 - np.abs(row - i)) * (1 - np.abs(column - j))
+            seen += weight[..., None] * texels[i % 3, j % 5] / 255
+    expected = srgb(np.where(seen <= 0.04045, seen / 12.92, ((seen + 0.055) / 1.055) ** 2.4) * color) * 255
+    found = out["albedo"].view(np.uint8).reshape(*column.shape, 4)[..., :3]
+    assert np.abs(found - expected).max() < 1.1
+    assert np.ptp(found, axis=(0, 1)).min() > 100
+    _, powers = _draw(corners, np.array([[0, 1, 2], [0, 2, 3]]), table=False, **texture)
+    assert (powers["albedo"] == out["albedo"]).all()

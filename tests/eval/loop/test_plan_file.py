@@ -57,10 +57,16 @@ def test_a_row_of_one_task_and_tracker_has_its_demonstrations_alone(tmp_path):
     assert {(row.tasks, row.trackers) for row in singles} == {
         ((task,), (tracker,)) for task in plan.attempts for tracker in plan.record.tracker
     }
-    samples = {row.tasks[0]: row.train.steps * row.train.batch_size for row in singles}
+    samples = {(row.tasks[0], row.trackers[0]): row.train.steps * row.train.batch_size for row in singles}
+    assert merged.train.steps * merged.train.batch_size == sum(samples.values())
     weights = {task: float(weight) for task, weight in (one.split("=") for one in merged.train.task_weights)}
-    assert 2 * sum(samples.values()) == merged.train.steps * merged.train.batch_size
-    assert {task: count / 64_000 for task, count in samples.items()} == weights
+    assert {pair: 64_000 * weights[pair[0]] for pair in samples} == samples
+    assert (set(merged.tasks), set(merged.trackers)) == (set(plan.attempts), set(plan.record.tracker))
+    own = {"steps", "batch_size", "balance", "task_weights"}
+    for row in singles:
+        assert {k: v for k, v in vars(row.train).items() if k not in own} == {
+            k: v for k, v in vars(merged.train).items() if k not in own
+        }
     commands = made(plan, tmp_path, rows=[plan.row("boxing-sonic")], seeds=[1])
     training = commands["train boxing-sonic_1"]
     words = training.words()
