@@ -63,9 +63,13 @@ def _prepared(command: wp.Launch) -> Callable[[], object] | None:
         return None
     if not plain or len(arguments) != len(values):
         return None
-    fields = [(argument.label, type(value)) for argument, value in zip(arguments, values, strict=True)]
-    structure = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
-    return functools.partial(forward, ctypes.byref(bounds), ctypes.byref(structure))
+    fields = tuple((argument.label, type(value)) for argument, value in zip(arguments, values, strict=True))
+    return functools.partial(forward, ctypes.byref(bounds), ctypes.byref(_structure(fields)(*values)))
+
+
+@functools.cache
+def _structure(fields: tuple[tuple[str, type], ...]) -> type[ctypes.Structure]:
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
 class _Recording(threading.local):

@@ -18,8 +18,10 @@ from arena_newton.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["cluster_engine", "resolve_engine", "torch_device", "torch_threads", "visible_gpus"]
+__all__ = ["cluster_engine", "drawing_threads", "resolve_engine", "torch_device", "torch_threads", "visible_gpus"]
 
+ALONE = 60_000
+"""Most pixels that one thread draws alone [px]."""
 NVIDIA_DEVICES = Path("/proc/driver/nvidia/gpus")
 """Folder with an entry per GPU that the driver of this machine knows."""
 DRIVERS = ("libcuda.so", "libcuda.so.1")
@@ -92,6 +94,13 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def drawing_threads(pixels: int) -> int:
+    """Threads that draw so many pixels on the CPU: those of torch, or one where starting others takes longer."""
+    import torch
+
+    return torch.get_num_threads() if pixels > ALONE else 1
 
 
 def _loads(library: str) -> bool:

@@ -26,6 +26,7 @@ from arena_newton.errors import InputError
 from arena_newton.kernels.pictures.lighting import display_curve, launch_camera_poses, launch_shade
 from arena_newton.kernels.pictures.raster import launch_rasterize
 from arena_newton.kernels.pictures.shadow import MAPPED, Occluders, ShadowMaps, launch_shadow_maps, traced
+from arena_newton.physics.devices import drawing_threads
 from arena_newton.pictures.settings import DOME_COLOR, DOME_INTENSITY, CameraConfig, Fit
 from arena_newton.pictures.triangles import srgb_to_linear, triangles
 
@@ -547,7 +548,7 @@ class Camera:
                 size=self._size,
                 origin=self._origin,
                 image=image,
-                threads=torch.get_num_threads(),
+                threads=drawing_threads(buffers.depth.size),
             )
 
     def _shadow_maps(self, lights: WorldLights) -> ShadowMaps:
@@ -589,7 +590,7 @@ class Camera:
             albedo=buffers.albedo,
             normals=buffers.normals,
             depth=buffers.depth,
-            threads=torch.get_num_threads(),
+            threads=drawing_threads(buffers.depth.size),
         )
 
 

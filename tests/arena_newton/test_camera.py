@@ -9,6 +9,9 @@ import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from arena_newton.errors import InputError
+from arena_newton.kernels import launching
+from arena_newton.physics import devices
+from arena_newton.physics.devices import torch_threads
 from arena_newton.pictures.camera import Camera, CameraConfig, WorldLights
 
 WORLDS = 3
@@ -148,6 +151,22 @@ def test_samples_smooth_edges(model):
     assert abs(fine - soft).max() <= 1
     assert abs(hard.mean() - soft.mean()) < 2
     assert len(np.unique(soft.reshape(-1, 3), axis=0)) > len(np.unique(hard.reshape(-1, 3), axis=0))
+
+
+def test_threads_draw_the_same_bits(model, monkeypatch):
+    """Several threads draw what one draws, under a dome and a sun; few pixels are drawn by one."""
+    lights = WorldLights.allocate(WORLDS, "cpu")
+    lights.set(1, _light((1, 0, -2)))
+    used = []
+    divided = launching.ThreadPoolExecutor
+    monkeypatch.setattr(launching, "ThreadPoolExecutor", lambda threads: used.append(threads) or divided(threads))
+    with torch_threads(3):
+        alone = _camera(model, lights).render(model.state()).numpy().copy()
+        assert not used
+        monkeypatch.setattr(devices, "ALONE", 0)
+        shared = _camera(model, lights).render(model.state()).numpy()
+    assert used == [3, 3, 3]
+    assert (shared == alone).all()
 
 
 def test_drawing_agrees_with_ray_tracing(model):
