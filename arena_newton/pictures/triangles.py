@@ -127,7 +127,7 @@ def triangles(model: newton.Model) -> tuple[Soup, int, tuple[int, int]]:
     soup.scales, soup.transforms = array(scales, wp.vec3), model.bvh_shape_world_transforms
     soup.colors = array(srgb_to_linear(model.shape_color.numpy()), wp.vec3)
     soup.packed = wp.zeros(soup.colors.shape, dtype=wp.uint32, device=model.device)
-    soup.levels = wp.zeros((0 if model.device.is_cuda else 1, 256), dtype=wp.float32, device=model.device)
+    soup.levels = wp.zeros(0 if model.device.is_cuda else 256, dtype=wp.float32, device=model.device)
     soup.texture = array(texture, wp.int32)
     soup.faces, soup.vertices = array(np.concatenate(faces), wp.vec3i), array(np.concatenate(vertices), wp.vec3)
     soup.normals, soup.uvs = array(np.concatenate(normals), wp.vec3), array(np.concatenate(uvs), wp.vec2)

@@ -19,18 +19,17 @@ def as_float(bits: wp.uint32) -> wp.float32:
 
 
 @wp.func
-def settled(levels: wp.array2d[wp.float32], row: wp.int32, value: wp.float32, guess: wp.int32) -> wp.uint32:
+def settled(levels: wp.array[wp.float32], value: wp.float32, guess: wp.int32) -> wp.uint32:
     """Byte of a value: the last whose level it reaches.
 
     Args:
-        levels: Least value of each byte, shape [rows, 256].
-        row: Curve of the value.
+        levels: Least value of each byte, shape [256].
         value: At least 0, no NaN.
         guess: Where the search begins, any number.
     """
     byte = wp.clamp(guess, 0, 255)
-    while byte < 255 and value >= levels[row, byte + 1]:
+    while byte < 255 and value >= levels[byte + 1]:
         byte += 1
-    while byte > 0 and value < levels[row, byte]:
+    while byte > 0 and value < levels[byte]:
         byte -= 1
     return wp.uint32(byte)

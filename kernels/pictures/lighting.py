@@ -87,10 +87,10 @@ def _byte(value: wp.float32) -> wp.uint8:
 
 @wp.struct
 class DisplayCurve:
-    """Bytes of the display by table; without rows on CUDA, where powers are quick."""
+    """Bytes of the display by table; empty on CUDA, where powers are quick."""
 
-    levels: wp.array2d[wp.float32]
-    """Least radiance of each byte, shape [1, 256]."""
+    levels: wp.array[wp.float32]
+    """Least radiance of each byte, shape [256]."""
     guesses: wp.array[wp.uint8]
     """Byte of the first radiance of each of `GUESSES` steps: upper bits of a float, from those of `DARKEST` on."""
 
@@ -122,16 +122,16 @@ def _fill_curve(curve: DisplayCurve):
             high = middle
         else:
             low = middle + wp.uint32(1)
-    curve.levels[0, number] = as_float(low)
+    curve.levels[number] = as_float(low)
 
 
 def display_curve(device: wp.Device) -> DisplayCurve:
     """The table of a device."""
     curve = DisplayCurve()
-    rows = 0 if device.is_cuda else 1
-    curve.levels = wp.zeros((rows, 256), dtype=wp.float32, device=device)
-    curve.guesses = wp.zeros(rows * GUESSES, dtype=wp.uint8, device=device)
-    launch(_fill_curve, rows * GUESSES, [curve], [], device)
+    steps = 0 if device.is_cuda else GUESSES
+    curve.levels = wp.zeros(min(256, steps), dtype=wp.float32, device=device)
+    curve.guesses = wp.zeros(steps, dtype=wp.uint8, device=device)
+    launch(_fill_curve, steps, [curve], [], device)
     return curve
 
 
@@ -140,7 +140,7 @@ def _curved(curve: DisplayCurve, radiance: wp.float32) -> wp.uint8:
     """Byte of a radiance, at least 0 and no NaN."""
     step = wp.int32(wp.cast(radiance, wp.uint32) >> STEP_BITS) - wp.int32(DARKEST >> STEP_BITS)
     guess = wp.int32(curve.guesses[wp.clamp(step, 0, GUESSES - 1)])
-    return wp.uint8(settled(curve.levels, 0, radiance, guess))
+    return wp.uint8(settled(curve.levels, radiance, guess))
 
 
 @wp.func
@@ -256,7 +256,7 @@ def launch_shade(
         normals: World-space normals, same shape.
         depth: Distance along the ray [m], 0 where it met nothing, same shape.
         decode: Linear value of each sRGB byte, float32 [256].
-        curve: Of `display_curve`; one without rows computes the same bytes by powers.
+        curve: Of `display_curve`; an empty one computes the same bytes by powers.
         distant: int32 [worlds], 1 for a distant light, 0 for a dome.
         direction: Unit vector from the light to the scene, shape [worlds].
         light: Intensity times colour, shape [worlds].

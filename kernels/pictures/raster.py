@@ -41,9 +41,9 @@ class Soup:
     """Linear albedo of each shape."""
     packed: wp.array[wp.uint32]
     """The same as sRGB, packed as RGBA."""
-    levels: wp.array2d[wp.float32]
-    """Least sRGB value in a white shape's texture that gives each byte, shape [1, 256]; no rows on CUDA, where powers
-    are quick."""
+    levels: wp.array[wp.float32]
+    """Least sRGB value in a white shape's texture that gives each byte, shape [256]; empty on CUDA, where powers are
+    quick."""
     texture: wp.array[wp.int32]
     """Texture of each shape, −1 for none."""
     faces: wp.array[wp.vec3i]
@@ -254,12 +254,12 @@ def _fill_levels(soup: Soup):
             high = middle
         else:
             low = middle + wp.uint32(1)
-    soup.levels[0, byte] = as_float(low)
+    soup.levels[byte] = as_float(low)
 
 
 @wp.func
 def _texture_byte(soup: Soup, seen: wp.float32) -> wp.uint32:
-    return settled(soup.levels, 0, seen, wp.int32(seen * 255.0))
+    return settled(soup.levels, seen, wp.int32(seen * 255.0))
 
 
 @wp.func
@@ -359,7 +359,7 @@ def _resolve(
 def launch_albedo(soup: Soup) -> None:
     """Fill `packed` and `levels`, which have memory, by what the soup says besides; once, as neither changes."""
     launch(_pack_colors, soup.packed.shape, [soup], [], soup.packed.device)
-    launch(_fill_levels, soup.levels.size, [soup], [], soup.packed.device)
+    launch(_fill_levels, soup.levels.shape, [soup], [], soup.packed.device)
 
 
 def launch_rasterize(
