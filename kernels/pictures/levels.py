@@ -6,7 +6,7 @@ of the least float of each byte, found by bisection of the function itself, give
 
 import warp as wp
 
-__all__ = ["LARGEST", "as_float", "settled"]
+__all__ = ["as_float", "level_of", "settled"]
 
 LARGEST = wp.constant(wp.uint32(0x7F7FFFFF))
 """Bits of the largest float, at which a bisection begins; positive floats are ordered as their bits."""
@@ -16,6 +16,28 @@ LARGEST = wp.constant(wp.uint32(0x7F7FFFFF))
 def as_float(bits: wp.uint32) -> wp.float32:
     """The float that has these bits."""
     return wp.cast(bits, wp.float32)
+
+
+def level_of(byte_of: wp.Function) -> wp.Function:
+    """A function that gives the least float of a byte, by bisection.
+
+    Args:
+        byte_of: Byte of a float, which rises with it.
+    """
+
+    @wp.func
+    def level(byte: wp.int32) -> wp.float32:
+        low = wp.uint32(0)
+        high = LARGEST
+        while low < high:
+            middle = low + (high - low) / wp.uint32(2)
+            if wp.int32(byte_of(as_float(middle))) >= byte:
+                high = middle
+            else:
+                low = middle + wp.uint32(1)
+        return as_float(low)
+
+    return level
 
 
 @wp.func

@@ -18,7 +18,7 @@ from typing import Any
 import warp as wp
 
 from arena_newton.kernels.launching import launch, launch_divided
-from arena_newton.kernels.pictures.levels import LARGEST, as_float, settled
+from arena_newton.kernels.pictures.levels import as_float, level_of, settled
 from arena_newton.kernels.pictures.raster import srgb
 
 __all__ = ["FULL_LIGHT", "DisplayCurve", "display_curve", "launch_camera_poses", "launch_shade"]
@@ -108,21 +108,15 @@ def _display_byte(radiance: wp.float32) -> wp.uint8:
     return _byte(_display(radiance))
 
 
+_display_level = level_of(_display_byte)
+
+
 @wp.kernel(enable_backward=False)
 def _fill_curve(curve: DisplayCurve):
     number = wp.tid()
     curve.guesses[number] = _display_byte(as_float(DARKEST + (wp.uint32(number) << STEP_BITS)))
-    if number > 255:
-        return
-    low = wp.uint32(0)
-    high = LARGEST
-    while low < high:
-        middle = low + (high - low) / wp.uint32(2)
-        if wp.int32(_display_byte(as_float(middle))) >= number:
-            high = middle
-        else:
-            low = middle + wp.uint32(1)
-    curve.levels[number] = as_float(low)
+    if number < 256:
+        curve.levels[number] = _display_level(number)
 
 
 def display_curve(device: wp.Device) -> DisplayCurve:

@@ -6,7 +6,7 @@ Each triangle is drawn once into a depth buffer of 64-bit keys (nearness above, 
 import warp as wp
 
 from arena_newton.kernels.launching import launch, launch_divided
-from arena_newton.kernels.pictures.levels import LARGEST, as_float, settled
+from arena_newton.kernels.pictures.levels import level_of, settled
 
 __all__ = ["Soup", "launch_albedo", "launch_rasterize"]
 
@@ -243,18 +243,19 @@ def _pack_colors(soup: Soup):
     soup.packed[shape] = _pack(_albedo_byte(colour[0]), _albedo_byte(colour[1]), _albedo_byte(colour[2]))
 
 
+@wp.func
+def _seen_byte(seen: wp.float32) -> wp.uint32:
+    """Byte of a white shape where its texture has an sRGB value."""
+    return _albedo_byte(_linear(seen))
+
+
+_seen_level = level_of(_seen_byte)
+
+
 @wp.kernel(enable_backward=False)
 def _fill_levels(soup: Soup):
     byte = wp.tid()
-    low = wp.uint32(0)
-    high = LARGEST
-    while low < high:
-        middle = low + (high - low) / wp.uint32(2)
-        if _albedo_byte(_linear(as_float(middle))) >= wp.uint32(byte):
-            high = middle
-        else:
-            low = middle + wp.uint32(1)
-    soup.levels[byte] = as_float(low)
+    soup.levels[byte] = _seen_level(byte)
 
 
 @wp.func
