@@ -26,6 +26,7 @@ import arena_newton.kernels  # noqa: F401  (quiets Warp's module log)
 from arena_newton import tasks
 from arena_newton.errors import InputError
 from arena_newton.kernel_cache.kernel_loading import forward_only
+from arena_newton.kernel_cache.narrowphase import write_out_pairs
 from arena_newton.kernel_cache.solver_options import collide_boxes_as_mujoco
 from arena_newton.physics.ball import BALL, BALL_SKIN, add_skin, set_restitution
 from arena_newton.robot import g1
@@ -395,6 +396,8 @@ def load_scene(
         InputError: The stage cannot be read or misses a prim that the robot needs.
     """
     forward_only()
+    if not native:
+        write_out_pairs()
     path = scene_path(variant_file or task)
     stage = _open_stage(path, variant, hands)
 

@@ -1,0 +1,65 @@
+"""mujoco_warp's collision kernel with its pairs written out: the same contacts, named without generating its code."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import pytest
+from mujoco_warp._src import collision_primitive, warp_util
+
+from arena_newton.kernel_cache.narrowphase import FACTORY, write_out_pairs
+
+SHAPES = """<mujoco><worldbody>
+<geom type="plane" size="5 5 .1"/>
+<body pos="0 0 .1"><freejoint/><geom type="sphere" size=".12"/></body>
+<body pos=".15 0 .1"><freejoint/><geom type="capsule" size=".1 .2" euler="80 10 0"/></body>
+<body pos=".3 .1 .1"><freejoint/><geom type="box" size=".12 .1 .11" euler="5 3 20"/></body>
+<body pos=".4 .2 .15"><freejoint/><geom type="box" size=".1 .1 .1" euler="0 30 0"/></body>
+</worldbody></mujoco>"""
+
+
+def contacts(monkeypatch: pytest.MonkeyPatch, factory: object) -> tuple[bool, list[np.ndarray]]:
+    """Whether the kernel's functions were known from its source alone, and the contacts of `SHAPES`."""
+    made = []
+
+    def making(types: list, functions: list) -> object:
+        made.append(factory(types, functions))
+        return made[-1]
+
+    monkeypatch.setattr(warp_util, "_KERNEL_CACHE", {})
+    monkeypatch.setattr(collision_primitive, FACTORY, making)
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nconmax=64)
+    mujoco_warp.kinematics(m, d)
+    mujoco_warp.collision(m, d)
+    found = d.contact
+    rows = [values.numpy()[: d.nacon.numpy()[0]] for values in (found.dist, found.pos, found.frame, found.geom)]
+    return made[0].adj.has_unresolved_static_expressions, rows
+
+
+def test_the_same_contacts_by_a_kernel_that_is_named_from_its_source(monkeypatch: pytest.MonkeyPatch):
+    write_out_pairs()
+    ours = getattr(collision_primitive, FACTORY)
+    library = ours.args[0]
+    deferred, theirs = contacts(monkeypatch, library)
+    resolved, found = contacts(monkeypatch, ours)
+    assert deferred and not resolved
+    assert len(theirs[0]) >= 8 and {tuple(pair) for pair in theirs[3]} >= {(0, 1), (0, 2), (0, 3), (1, 2), (3, 4)}
+    for a, b in zip(theirs, found, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_another_version_of_the_kernel_is_left_alone(monkeypatch: pytest.MonkeyPatch):
+    def factory(types: list, functions: list) -> SimpleNamespace:
+        return SimpleNamespace()
+
+    monkeypatch.setattr(collision_primitive, FACTORY, factory)
+    write_out_pairs()
+    assert getattr(collision_primitive, FACTORY) is factory
+    monkeypatch.delattr(collision_primitive, FACTORY)
+    write_out_pairs()
+    assert not hasattr(collision_primitive, FACTORY)
