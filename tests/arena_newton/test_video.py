@@ -50,6 +50,27 @@ def test_odd_sizes_are_padded(tmp_path):
     assert frame[:20, :32].mean() > 240
 
 
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (21, 33), (70, 62)])
+@pytest.mark.parametrize("how", [{}, {"b_frames": False, "gop": 2}, {"b_frames": False, "lossless": True}])
+def test_colours_come_back(tmp_path, height, width, how):
+    """A frame of four colours is read with them, at its own place, also beside others and where rows are padded."""
+    colours = np.array([[200, 30, 40], [40, 180, 60], [50, 60, 210], [230, 220, 30]], np.uint8)
+    frame = np.zeros((height, width, 3), np.uint8)
+    half, middle = height // 2, width // 2
+    for number, colour in enumerate(colours):
+        rows = slice(0, half) if number < 2 else slice(half, None)
+        frame[rows, slice(0, middle) if number % 2 == 0 else slice(middle, None)] = colour
+    with VideoWriter(tmp_path / "c.mp4", width, height, crf=10, **how) as writer:
+        for pictures in (frame, frame[::-1], frame):
+            writer.write(pictures)
+    with av.open(str(tmp_path / "c.mp4")) as container:
+        read = [one.to_ndarray(format="rgb24")[:height, :width].astype(int) for one in container.decode(video=0)]
+    for one, wanted in zip(read, (frame, frame[::-1], frame), strict=True):
+        off = np.abs(one - wanted)
+        assert off.mean() < 8 and np.median(off) <= 3  # colours of neighbours mix
+        assert "lossless" not in how or not off.any()
+
+
 def test_failed_video_leaves_nothing(tmp_path):
     """Neither an interrupted video nor one without frames leaves a file."""
     with pytest.raises(RuntimeError), VideoWriter(tmp_path / "x.mp4", 64, 48) as writer:
