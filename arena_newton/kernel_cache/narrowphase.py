@@ -6,9 +6,11 @@ The loop calls `wp.static(functions[i])`, and Warp learns which functions these 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import linecache
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 
@@ -28,9 +30,23 @@ def write_out_pairs() -> None:
     """Replace the function that makes the kernel, unless that is done or the installed version writes it otherwise."""
     library = getattr(collision_primitive, FACTORY, None)
     if inspect.isfunction(library):
-        source = inspect.getsource(library)
-        if source.count(LOOP) == 1 and source.count(END) == 1:
+        with contextlib.suppress(OSError, ValueError):  # without its source, or with another one, it stays
+            _parts(library)
             setattr(collision_primitive, FACTORY, functools.partial(_kernel, library))
+
+
+def _parts(library: Factory) -> tuple[str, str]:
+    """Source up to the loop, and a turn of the loop as statements beside it.
+
+    Raises:
+        ValueError: There is no such loop.
+        OSError: There is no source.
+    """
+    head, *rest = inspect.getsource(library).split(LOOP)
+    body, *after = "".join(rest).split(END)
+    if len(rest) != 1 or after != [""] or re.search(r"\bi\b", body.replace("[i]", "")):
+        raise ValueError(FACTORY)
+    return head, textwrap.indent(textwrap.dedent(body), "    ")
 
 
 def _kernel(library: Factory, types: Sequence[object], functions: Sequence[wp.Function]) -> wp.Kernel:
@@ -41,13 +57,11 @@ def _kernel(library: Factory, types: Sequence[object], functions: Sequence[wp.Fu
 @functools.cache
 def _factory(library: Factory, pairs: int) -> Factory:
     """The library's function with its loop written out for so many kinds of pairs."""
-    head, _, rest = inspect.getsource(library).partition(LOOP)
-    body, _, _ = rest.partition(END)
-    turn = textwrap.indent(textwrap.dedent(body), "    ")
+    head, turn = _parts(library)
     written = head + "\n".join(turn.replace("[i]", f"[{number}]") for number in range(pairs)) + END
     name = f"<{FACTORY} of {pairs} pairs>"
     linecache.cache[name] = (len(written), None, written.splitlines(keepends=True), name)  # Warp reads the source here
     names = dict(vars(collision_primitive))
-    exec(compile(written, name, "exec"), names)
+    exec(compile(written, name, "exec", dont_inherit=True), names)
     made: Factory = names[FACTORY]
     return made

@@ -50,10 +50,15 @@ def test_odd_sizes_are_padded(tmp_path):
     assert frame[:20, :32].mean() > 240
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 64), (21, 33), (70, 62)])
-@pytest.mark.parametrize("how", [{}, {"b_frames": False, "gop": 2}, {"b_frames": False, "lossless": True}])
+LOSSLESS = {"b_frames": False, "lossless": True}
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "how"),
+    [(48, 64, {}), (70, 62, {"b_frames": False, "gop": 2}), (70, 62, LOSSLESS), (21, 33, LOSSLESS)],
+)
 def test_colours_come_back(tmp_path, height, width, how):
-    """A frame of four colours is read with them, at its own place, also beside others and where rows are padded."""
+    """A frame of four colours is read with them, each at its own place, also between others."""
     colours = np.array([[200, 30, 40], [40, 180, 60], [50, 60, 210], [230, 220, 30]], np.uint8)
     frame = np.zeros((height, width, 3), np.uint8)
     half, middle = height // 2, width // 2
