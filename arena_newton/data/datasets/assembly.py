@@ -162,8 +162,9 @@ class _Pictures:
                 context = stream.codec_context
                 if context is None:
                     raise InputError(f"{where}: its codec is unknown")
-                kind = (context.name, context.width, context.height, context.extradata, stream.time_base)
                 packets = self._packets(source, stream, part, where)
+                own = _parameter_sets(packets, context.extradata or b"") if context.name == "h264" else None
+                kind = (context.name, context.width, context.height, context.extradata, stream.time_base, own)
                 size = sum(packet.size for packet in packets)
                 if self._out is None or kind != self._kind or self.size + size > self.bytes:
                     self._begin(stream, kind)
@@ -223,6 +224,19 @@ class _Pictures:
         if self._out is not None:
             self._out.close()
         self._out = None
+
+
+def _parameter_sets(packets: Sequence[av.Packet], extradata: bytes) -> frozenset[bytes]:
+    """H.264 parameter sets among the pictures that the file's head lacks: what follows them is decoded by them."""
+    found = set()
+    for packet in packets:
+        data, at = bytes(packet) if packet.is_keyframe else b"", 0
+        while at + 5 <= len(data):
+            end = at + 4 + int.from_bytes(data[at : at + 4], "big")
+            if data[at + 4] & 31 in (7, 8) and data[at + 4 : end] not in extradata:
+                found.add(data[at + 4 : end])
+            at = end
+    return frozenset(found)
 
 
 def write_selection(selections: Sequence[Selection], root: Path) -> None:

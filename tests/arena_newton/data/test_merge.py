@@ -129,6 +129,24 @@ def test_lerobot_reads_what_was_merged(built):
         assert item["task"] == ("Kick the soccer ball into the goal." if index >= 93 else DatasetFiles(out).tasks[0])
 
 
+def test_pictures_of_two_encoders_are_merged(tmp_path):
+    """A set that has episodes of two entropy coders is continued by none of the others' pictures in the same file."""
+    for repeat in range(3):
+        make_episode(tmp_path / f"r{repeat}", 30 + repeat, repeat=repeat)
+    film = next(tmp_path.glob("r1/**/*_front_rgb.mp4"))
+    with av.open(str(film)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    with VideoWriter(film, *frames[0].shape[1::-1], 50, gop=10, b_frames=False) as writer:
+        writer._stream.options |= {"coder": "0"}
+        for frame in frames:
+            writer.write(frame)
+    for name, recordings in {"a": ["r0", "r1"], "b": ["r2"]}.items():
+        assert main(["build", *(str(tmp_path / one) for one in recordings), "--out", str(tmp_path / name)]) == 0
+    assert main(["merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "merged")]) == 0
+    shown = pictures(tmp_path / "merged")
+    np.testing.assert_array_equal(shown, np.concatenate([pictures(tmp_path / "a"), pictures(tmp_path / "b")]))
+
+
 def released(root, actions):
     """A set of the original's schema, with a small video where its own is."""
     write_dataset(root, actions)
