@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -170,6 +172,12 @@ class LearnedPolicy(Policy):
         return torch.tensor(numbers, device=device) if numbers else None
 
 
+@functools.cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads for queries, each of one core; a process that was forked has its own."""
+    return ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+
+
 def _answers(
     device: torch.device, query: Callable[[list[int], int], torch.Tensor], parts: list[list[int]]
 ) -> Iterator[torch.Tensor]:
@@ -184,7 +192,8 @@ def _answers(
         return
     last = len(parts) % threads
     whole, divided = parts[: len(parts) - last], parts[len(parts) - last :]
-    with torch_threads(1), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    pool = _pool(threads, os.getpid())
+    with torch_threads(1):
         yield from pool.map(lambda some: query(some, 1), whole)
         yield from pool.map(lambda some: query(some, min(threads - last + 1, HELPED)), divided)
 

@@ -46,10 +46,14 @@ Network = Callable[[torch.Tensor], torch.Tensor]
 
 
 def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
-    """Options of a session on some threads that does not write to the screen; a thread that waits takes no core."""
+    """Options of a session on some threads that does not write to the screen.
+
+    Several threads that share a product wait for each other's parts without sleeping, and no longer than it takes.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.intra_op.allow_spinning", str(int(threads > 1)))
+    options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 4
     return options
 
