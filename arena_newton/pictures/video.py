@@ -92,7 +92,7 @@ class VideoWriter:
             b_frames: Allow frames that are predicted from later ones: smaller, slower to read in any order.
             sync: Wait at the end until the file is on the disk.
             lossless: Keep every byte of the frames; `crf` is not used. Their preset takes half the time to encode, and
-                its entropy coder half the time to decode, for files larger by a fifth.
+                their entropy coder half the time to decode, for files larger by a fifth.
 
         Raises:
             OSError: The file cannot be written; the error carries its name.

@@ -24,7 +24,7 @@ SHAPES = """<mujoco><worldbody>
 
 
 def contacts(monkeypatch: pytest.MonkeyPatch, factory: object) -> tuple[bool, list[np.ndarray]]:
-    """Whether the kernel's functions were known from its source alone, and the contacts of `SHAPES`."""
+    """Contacts of `SHAPES`, after True where the kernel's functions were not known from its source alone."""
     made = []
 
     def making(types: list, functions: list) -> object:
