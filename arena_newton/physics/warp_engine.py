@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import mujoco
 import mujoco_warp
@@ -72,7 +73,9 @@ class WarpPhysics(Physics):
         published = (self.xpos, self.xquat, self.xipos, self.contact_force, self.pair_force)
         arrays = [getattr(d, name) for name in _STATE] + [*published, self.latch_locked, self.overflow]
         self._state = [self._words(array) for array in arrays if array.size]
-        self._before: list[wp.array] | None = None
+        self._before = [wp.empty_like(words) for words in self._state]
+        self._hold_graphs: tuple[wp.Graph, wp.Graph] | None = None
+        """Keeps the state before a tick, and puts idle worlds back after it."""
         self._reset_all()
 
     def _floats(self, array: wp.array, *shape: int) -> wp.array:
@@ -130,16 +133,21 @@ class WarpPhysics(Physics):
     def step(self) -> None:
         """See `Physics.step`; sums of contact forces (float atomics) are not bit-deterministic on CUDA."""
         with wp.ScopedDevice(self.device):
-            hold = bool(self._idle_host.any())
-            if hold:
-                self._before = self._before or [wp.empty_like(words) for words in self._state]
-                for saved, words in zip(self._before, self._state, strict=True):
-                    wp.copy(saved, words)
             if self._tick_graph is None:
                 self._tick_graph = self._capture(self._launch_tick)
-            wp.capture_launch(self._tick_graph)
-            if hold and self._before is not None:
-                self._put_back(self._before, self._idle)
+            if not self._idle_host.any():
+                wp.capture_launch(self._tick_graph)
+                return
+            if self._hold_graphs is None:
+                put_back = partial(self._put_back, self._before, self._idle)
+                self._hold_graphs = self._capture(self._keep), self._capture(put_back)
+            before, after = self._hold_graphs
+            for graph in (before, self._tick_graph, after):
+                wp.capture_launch(graph)
+
+    def _keep(self) -> None:
+        for saved, words in zip(self._before, self._state, strict=True):
+            wp.copy(saved, words)
 
     def _launch_tick(self) -> None:
         door = self.scene.latch
