@@ -15,9 +15,10 @@ from pathlib import Path
 
 import warp as wp
 
+from arena_newton import policies
 from arena_newton.cli.flags import user_path
 from arena_newton.errors import ArenaError
-from arena_newton.eval.bench.timing import BenchFigure
+from arena_newton.eval.bench.timing import BenchFigure, RepeatedEpisodes
 from arena_newton.eval.folders.recordings import OUTCOMES_FILE
 from arena_newton.eval.folders.results import load_run
 from arena_newton.eval.plan.episode_plan import PROTOCOL_REPEATS
@@ -65,16 +66,20 @@ def lerobot_eval_figures(options: PeerOptions) -> Iterator[BenchFigure]:
         return
     checkpoint = SHIPPED if options.checkpoint is None else user_path(options.checkpoint)
     checkpoint = checkpoint_folder(checkpoint, "--checkpoint ")
-    rounds, plays, notes = [], [], []
+    both = []
     for _ in range(options.long_rounds):
         with tempfile.TemporaryDirectory() as made:
             folder = Path(made)
             ours = _ours(options, checkpoint, episodes, cuda, folder / "ours")
             peer = _peer(options, checkpoint, episodes, cuda, folder / "peer")
-        rounds.append((episodes / ours.command_seconds, episodes / peer.command_seconds))
-        plays.append(peer.seconds / ours.seconds)
-        notes.append(f"{ours.text} / {peer.text}")
-    notes.insert(0, f"without start and end {statistics.median(plays):.2f} x")
+        both.append((ours, peer))
+    rounds = [(episodes / ours.command_seconds, episodes / peer.command_seconds) for ours, peer in both]
+    plays = statistics.median(peer.seconds / ours.seconds for ours, peer in both)
+    notes = [f"without start and end {plays:.2f} x", *(f"{ours.text} / {peer.text}" for ours, peer in both)]
+    if cuda:
+        physics = _physics_seconds(options, checkpoint, episodes)
+        least = [peer.command_seconds / (ours.command_seconds - ours.seconds + physics) for ours, peer in both]
+        notes.append(f"our start and end and {physics:.1f} s of physics give {statistics.median(least):.2f} x at most")
     unjudged = on_cpu(cuda)
     if cuda and (episodes != CUDA_EPISODES or options.steps):
         unjudged = f"not judged (the bar is for {CUDA_EPISODES} whole episodes)"
@@ -82,11 +87,30 @@ def lerobot_eval_figures(options: PeerOptions) -> Iterator[BenchFigure]:
     yield PAIR.judge(options, label, rounds, unjudged=unjudged, notes=notes)
 
 
+def _spec(options: PeerOptions, checkpoint: Path) -> str:
+    return "learned" if options.checkpoint is None else f"lerobot:{checkpoint}"
+
+
+def _series(episodes: int) -> tuple[list[int], int]:
+    """Group seeds of our episodes, and repeats of each."""
+    groups, rest = divmod(episodes, PROTOCOL_REPEATS)
+    return (list(range(groups)), PROTOCOL_REPEATS) if groups and not rest else ([0], episodes)
+
+
+def _physics_seconds(options: PeerOptions, checkpoint: Path, episodes: int) -> float:
+    """Time of the physics alone in the same episodes, all at once on CUDA [s]."""
+    seeds, repeats = _series(episodes)
+    policy = policies.get(_spec(options, checkpoint))
+    side = RepeatedEpisodes(TASK, policy, repeats, seeds=seeds, worlds=episodes, cuda=True)
+    side.play(2)  # loads and captures
+    parts, _ = side.parts(options.steps or None)
+    return parts["physics"]
+
+
 def _ours(options: PeerOptions, checkpoint: Path, episodes: int, cuda: bool, folder: Path) -> _Played:
     """Play them by `eval run`."""
-    spec = "learned" if options.checkpoint is None else f"lerobot:{checkpoint}"
-    groups, rest = divmod(episodes, PROTOCOL_REPEATS)
-    seeds, repeats = (list(range(groups)), PROTOCOL_REPEATS) if groups and not rest else ([0], episodes)
+    seeds, repeats = _series(episodes)
+    spec = _spec(options, checkpoint)
     line = [sys.executable, "-P", "-m", "arena_newton.eval", "run", "--task", TASK, "--tracker", "twist2"]
     line += ["--policy", spec, "--seeds", *map(str, seeds), "--repeats", str(repeats), "--worlds", str(episodes)]
     line += ["--engine", "warp" if cuda else "mujoco", "--device", "cuda" if cuda else "cpu", "--out", str(folder)]

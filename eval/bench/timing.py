@@ -185,7 +185,7 @@ class RepeatedEpisodes:
         ).run()
         return time.perf_counter() - began, results
 
-    def parts(self, ticks: int) -> tuple[dict[str, float], float]:
+    def parts(self, ticks: int | None) -> tuple[dict[str, float], float]:
         """Seconds of each part of a tick and of the whole, in a play in which each part waits for the device."""
         spent: dict[str, float] = {}
 

@@ -58,11 +58,13 @@ def test_whole_commands_are_compared(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("flags", "value"), [({}, 6.0), ({"episodes": 20}, None), ({"steps": 9}, None)])
 def test_the_bar_is_for_the_whole_protocol(monkeypatch, flags, value):
     """With CUDA only the protocol's 60 whole episodes, three group seeds of 20, are judged."""
-    programs = _Programs(monkeypatch, [10.0, 60.0], [7.0])
+    programs = _Programs(monkeypatch, [10.0, 60.0], [7.0])  # ours has a second of episodes
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: True)
     monkeypatch.setattr(peer_pairs, "device_name", lambda: "a GPU")
+    monkeypatch.setattr(peer_lerobot_eval, "_physics_seconds", lambda options, checkpoint, episodes: 3.0)
     (figure,) = lerobot_eval_figures(PeerOptions(long_rounds=1, **flags))
     assert figure.value == value and figure.verdict == ("-" if value is None else "pass")
+    assert "our start and end and 3.0 s of physics give 5.00 x at most" in figure.note
     ours = programs.commands[0]
     seeds = ours[ours.index("--seeds") + 1 : ours.index("--repeats")]
     assert len(seeds) * 20 == flags.get("episodes", 60) and ours[ours.index("--repeats") + 1] == "20"
