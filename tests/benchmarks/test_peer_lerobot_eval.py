@@ -61,10 +61,10 @@ def test_the_bar_is_for_the_whole_protocol(monkeypatch, flags, value):
     programs = _Programs(monkeypatch, [10.0, 60.0], [7.0])  # ours has a second of episodes
     monkeypatch.setattr(peer_lerobot_eval.wp, "is_cuda_available", lambda: True)
     monkeypatch.setattr(peer_pairs, "device_name", lambda: "a GPU")
-    monkeypatch.setattr(peer_lerobot_eval, "_physics_seconds", lambda options, checkpoint, episodes: 3.0)
+    monkeypatch.setattr(peer_lerobot_eval, "_physics_seconds", lambda options, checkpoint, episodes: 0.6)
     (figure,) = lerobot_eval_figures(PeerOptions(long_rounds=1, **flags))
     assert figure.value == value and figure.verdict == ("-" if value is None else "pass")
-    assert "our start and end and 3.0 s of physics give 5.00 x at most" in figure.note
+    assert "start, end and 0.6 s of physics by themselves would give about 6.25 x" in figure.note
     ours = programs.commands[0]
     seeds = ours[ours.index("--seeds") + 1 : ours.index("--repeats")]
     assert len(seeds) * 20 == flags.get("episodes", 60) and ours[ours.index("--repeats") + 1] == "20"
