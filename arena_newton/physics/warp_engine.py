@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import mujoco
 import mujoco_warp
@@ -73,9 +72,8 @@ class WarpPhysics(Physics):
         published = (self.xpos, self.xquat, self.xipos, self.contact_force, self.pair_force)
         arrays = [getattr(d, name) for name in _STATE] + [*published, self.latch_locked, self.overflow]
         self._state = [self._words(array) for array in arrays if array.size]
-        self._before = [wp.empty_like(words) for words in self._state]
-        self._hold_graphs: tuple[wp.Graph, wp.Graph] | None = None
-        """Keeps the state before a tick, and puts idle worlds back after it."""
+        self._hold: tuple[list[wp.array], wp.Graph, wp.Graph] | None = None
+        """The state before a tick, the graph that keeps it, and the one that puts idle worlds back after the tick."""
         self._reset_all()
 
     def _floats(self, array: wp.array, *shape: int) -> wp.array:
@@ -135,19 +133,22 @@ class WarpPhysics(Physics):
         with wp.ScopedDevice(self.device):
             if self._tick_graph is None:
                 self._tick_graph = self._capture(self._launch_tick)
-            if not self._idle_host.any():
-                wp.capture_launch(self._tick_graph)
-                return
-            if self._hold_graphs is None:
-                put_back = partial(self._put_back, self._before, self._idle)
-                self._hold_graphs = self._capture(self._keep), self._capture(put_back)
-            before, after = self._hold_graphs
-            for graph in (before, self._tick_graph, after):
+            graphs = [self._tick_graph]
+            if self._idle_host.any():
+                self._hold = self._hold or self._captured_hold()
+                _, keep, put_back = self._hold
+                graphs = [keep, self._tick_graph, put_back]
+            for graph in graphs:
                 wp.capture_launch(graph)
 
-    def _keep(self) -> None:
-        for saved, words in zip(self._before, self._state, strict=True):
-            wp.copy(saved, words)
+    def _captured_hold(self) -> tuple[list[wp.array], wp.Graph, wp.Graph]:
+        before = self.snapshot()
+
+        def keep() -> None:
+            for saved, words in zip(before, self._state, strict=True):
+                wp.copy(saved, words)
+
+        return before, self._capture(keep), self._capture(lambda: self._put_back(before, self._idle))
 
     def _launch_tick(self) -> None:
         door = self.scene.latch
